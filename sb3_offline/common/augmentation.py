@@ -1,0 +1,50 @@
+"""Random shifts of images, the augmentation that learning from pixels needs."""
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+# Images that share one offset. A slice per group is much cheaper than a gather per image, and 8 to 24 different offsets in
+# a batch are enough.
+GROUP_SIZE = 32
+
+
+def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) -> th.Tensor:
+    """
+    Shift each image by up to ``max_shift`` pixels in both directions, repeating its edge.
+
+    :param images: ``(batch, channels, height, width)``, any dtype
+    :param max_shift: largest shift in pixels; 0 returns the images as they are
+    :param rng: source of the offsets; ``GROUP_SIZE`` consecutive images share one
+    :return: a tensor like ``images``
+    """
+    if max_shift == 0:
+        return images
+    height, width = images.shape[-2:]
+    rows = th.arange(height, device=images.device)
+    columns = th.arange(width, device=images.device)
+    shifted = th.empty_like(images)
+    for start in range(0, len(images), GROUP_SIZE):
+        down, right = (int(offset) for offset in rng.integers(-max_shift, max_shift + 1, size=2))
+        group = images[start : start + GROUP_SIZE].index_select(2, (rows + down).clamp(0, height - 1))
+        shifted[start : start + GROUP_SIZE] = group.index_select(3, (columns + right).clamp(0, width - 1))
+    return shifted
+
+
+def shift_observations(
+    observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator
+) -> PyTorchObs:
+    """
+    Apply :func:`random_shift` to every image in a batch of observations; vectors pass unchanged.
+
+    :param observations: a batch, or a dict of batches
+    :param space: channel-first space of one observation
+    :param max_shift: largest shift in pixels
+    :param rng: source of the offsets
+    :return: the observations, shifted
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: shift_observations(observations[key], space[key], max_shift, rng) for key in space}  # type: ignore
+    return random_shift(observations, max_shift, rng) if is_image_space(space) else observations  # type: ignore[arg-type]

@@ -1,0 +1,294 @@
+"""The base of all algorithms: SB3's off-policy class, fed by a dataset instead of an environment."""
+
+import sys
+import time
+from os import PathLike
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common import utils
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_offline.common.augmentation import shift_observations
+from sb3_offline.common.stub_env import SpacesOnlyEnv
+from sb3_offline.data import OfflineDataset, OfflineReplayBuffer
+
+SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
+DatasetSource = str | PathLike | list[str | PathLike] | OfflineDataset
+
+
+class OfflineAlgorithm(OffPolicyAlgorithm):
+    """
+    The base for offline algorithms: batches come from an HDF5 dataset, and the environment is neither reset nor stepped
+    while learning. One timestep is one gradient step.
+
+    Everything around it is SB3's: callbacks, logger, ``save``/``load``, ``predict``, ``evaluate_policy``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment the policy is meant for: an env, a vectorized env, a registered id, or ``None``, which takes
+        the spaces from the dataset. It is used for its spaces only (and, where it is a ``VecNormalize``, its observation
+        statistics are fitted to the dataset).
+    :param dataset: Path of an HDF5 dataset, a glob pattern, a list of paths, or an open dataset
+    :param learning_rate: learning rate for the optimizers, a float or a function of the remaining progress (from 1 to 0)
+    :param batch_size: Transitions in a batch
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor
+    :param n_steps: length of the n-step windows that ``train()`` may use; windows never cross an episode
+    :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
+    :param random_shift: images are shifted by up to so many pixels, edges repeated (0: no augmentation)
+    :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``, which maps the file where it does not fit in memory
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param stats_window_size: kept for SB3's signature
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+    :param seed: Seed for the pseudo random generators; batches are drawn from a generator of their own
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    #: whether ``train()`` needs the dataset's action at the next step (and so leaves out each episode's last step)
+    needs_next_actions: bool = False
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        n_steps: int = 1,
+        target_update_interval: int = 1,
+        random_shift: int = 4,
+        dataset_storage: str = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: th.device | str = "auto",
+        seed: int | None = None,
+    ):
+        if env is None and dataset is not None:
+            opened = dataset if isinstance(dataset, OfflineDataset) else OfflineDataset(_first_path(dataset))
+            env = SpacesOnlyEnv(opened.observation_space, opened.action_space)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            support_multi_env=True,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+        )
+        # A plain attribute, so that `load(path, dataset=...)` can replace it; opened when the first batch is drawn.
+        self.dataset = dataset
+        self.dataset_storage = dataset_storage
+        self.target_update_interval = target_update_interval
+        self.random_shift = random_shift
+        self._sampler_state: dict[str, Any] | None = None
+        self._metrics: dict[str, tuple[th.Tensor, int]] = {}
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.env is None:
+            if not hasattr(self, "observation_space"):
+                raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
+            self.env = self._wrap_env(SpacesOnlyEnv(self.observation_space, self.action_space))
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        self.policy = self.policy.to(self.device)
+        self._convert_train_freq()
+        self._create_aliases()
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor  # type: ignore[assignment]
+
+    # ------------------------------------------------------------------ data
+
+    @property
+    def replay_buffer(self) -> OfflineReplayBuffer:  # type: ignore[override]
+        """The dataset as SB3's replay buffer; opened at the first use."""
+        if self._replay_buffer is None:
+            if self.dataset is None:
+                raise RuntimeError(
+                    f"{type(self).__name__} has no dataset to learn from: pass `dataset=` to the constructor, "
+                    "or `load(path, dataset=...)`"
+                )
+            self._replay_buffer = OfflineReplayBuffer(
+                self.dataset,
+                self.observation_space,
+                self.action_space,
+                device=self.device,
+                n_steps=self.n_steps,
+                gamma=self.gamma,
+                storage=self.dataset_storage,
+                next_actions=self.needs_next_actions,
+                seed=self.seed,
+            )
+            if self._sampler_state is not None:
+                self._replay_buffer.rng.bit_generator.state = self._sampler_state
+            self._fit_vec_normalize()
+        return self._replay_buffer
+
+    @replay_buffer.setter
+    def replay_buffer(self, buffer: ReplayBuffer | None) -> None:
+        self._replay_buffer: Any = buffer
+
+    def _fit_vec_normalize(self) -> None:
+        """Without a rollout, the running statistics of a ``VecNormalize`` have to come from the dataset."""
+        normalize = self._vec_normalize_env
+        if normalize is None or not normalize.training or not normalize.norm_obs:
+            return
+        statistics = self._replay_buffer.observation_statistics()
+        if isinstance(normalize.obs_rms, dict):
+            for key, rms in normalize.obs_rms.items():
+                rms.mean, rms.var, rms.count = statistics[key]
+        else:
+            normalize.obs_rms.mean, normalize.obs_rms.var, normalize.obs_rms.count = statistics
+
+    def augment(self, observations: PyTorchObs) -> PyTorchObs:
+        """
+        :param observations: a batch as the buffer gives it
+        :return: the batch with its images shifted by up to ``random_shift`` pixels
+        """
+        return shift_observations(observations, self.observation_space, self.random_shift, self.replay_buffer.rng)
+
+    # -------------------------------------------------------------- learning
+
+    def learn(
+        self: SelfOfflineAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1000,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOfflineAlgorithm:
+        """
+        Return a trained model.
+
+        :param total_timesteps: The number of gradient steps
+        :param callback: callback(s) called after every gradient step
+        :param log_interval: gradient steps between two dumps of the log (``None``: never)
+        :param tb_log_name: the name of the run for TensorBoard logging
+        :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
+        :param progress_bar: Display a progress bar using tqdm and rich.
+        :return: the trained model
+        """
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+
+        while self.num_timesteps < total_timesteps:
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            self.train(gradient_steps=1, batch_size=self.batch_size)
+            self.num_timesteps += 1
+            self._on_step()
+            callback.update_locals(locals())
+            if not callback.on_step():
+                break
+            if log_interval is not None and self.num_timesteps % log_interval == 0:
+                self.dump_logs()
+
+        callback.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        # SB3's own version resets the environment, which an offline learner must never do.
+        self.start_time = time.time_ns()
+        if reset_num_timesteps:
+            self.num_timesteps = 0
+        else:
+            total_timesteps += self.num_timesteps
+        self._total_timesteps = total_timesteps
+        self._num_timesteps_at_start = self.num_timesteps
+        self._metrics = {}
+        if not self._custom_logger:
+            self._logger = utils.configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
+        return total_timesteps, self._init_callback(callback, progress_bar)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callback = super()._init_callback(callback, progress_bar=False)
+        if progress_bar:
+            callback = CallbackList([callback, _GradientStepBar()])
+            callback.init_callback(self)
+        return callback
+
+    def _on_step(self) -> None:
+        """Called after each gradient step, before the callbacks."""
+
+    def _update_target(self) -> None:
+        if self._n_updates % self.target_update_interval == 0:
+            polyak_update(self.policy.critic.parameters(), self.policy.critic_target.parameters(), self.tau)
+
+    # --------------------------------------------------------------- logging
+
+    def _record(self, **metrics: th.Tensor) -> None:
+        """Add scalars to the means of the next log dump, without waiting for the device."""
+        for name, value in metrics.items():
+            total, count = self._metrics.get(name, (0.0, 0))
+            self._metrics[name] = (total + value.detach(), count + 1)  # type: ignore[assignment]
+
+    def dump_logs(self) -> None:
+        """Write the means since the last dump to the logger."""
+        time_elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        fps = int((self.num_timesteps - self._num_timesteps_at_start) / time_elapsed)
+        for name, (total, count) in self._metrics.items():
+            self.logger.record(f"train/{name}", float(total) / count)
+        self._metrics = {}
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("time/fps", fps)
+        self.logger.record("time/time_elapsed", int(time_elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+
+    # ---------------------------------------------------------------- saving
+
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        if self._replay_buffer is not None:
+            self._sampler_state = self._replay_buffer.rng.bit_generator.state
+        super().save(path, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_metrics"]
+        # An open dataset holds file maps; paths are kept, so that `load` can go on learning.
+        return [*excluded, "dataset"] if isinstance(self.dataset, OfflineDataset) else excluded
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer"], []
+
+
+class _GradientStepBar(ProgressBarCallback):
+    """SB3's bar advances by the number of environments; here a step is one gradient step."""
+
+    def _on_step(self) -> bool:
+        self.pbar.update(1)
+        return True
+
+
+def _first_path(dataset: Any) -> Any:
+    return dataset[0] if isinstance(dataset, (list, tuple)) else dataset

@@ -1,0 +1,278 @@
+"""
+Actor-critic policies of the offline algorithms.
+
+They are SB3's SAC policies with three differences that offline learning from pixels needs: the encoder is trained by the
+critic (SB3 lets the *actor* train a shared one), it is run once per image however many actions are then scored, and the
+actor's standard deviation can be kept above a floor.
+"""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_offline.common.torch_layers import NormalizedNatureCNN
+
+# Actions of a dataset often sit exactly on the bounds, where atanh is infinite.
+ACTION_LIMIT = 0.999
+
+
+class OfflineActor(Actor):
+    """
+    Tanh-Gaussian actor (policy) that can also score given actions.
+
+    :param std_min: floor of the standard deviation *before* the tanh squashing. A positive floor keeps the likelihood of
+        dataset actions bounded.
+    :param detach_encoder: whether the encoder belongs to the critic, so that no gradient of the actor reaches it
+    :param kwargs: see :class:`stable_baselines3.sac.policies.Actor`
+    """
+
+    def __init__(self, *args: Any, std_min: float = 0.0, detach_encoder: bool = True, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.std_min = std_min
+        self.detach_encoder = detach_encoder
+        self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "std_min": self.std_min, "detach_encoder": self.detach_encoder}
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
+        :return: features, ``(batch, features_dim)``, cut from the graph where the encoder is the critic's
+        """
+        with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
+            return self.extract_features(obs, self.features_extractor)
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        mean, log_std = self.gaussian_parameters(self.encode(obs))
+        return mean, log_std, {}
+
+    def gaussian_parameters(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: ``(batch, features_dim)``
+        :return: mean and log standard deviation of the Gaussian before tanh, each ``(batch, action_dim)``
+        """
+        latent = self.latent_pi(features)
+        return self.mu(latent), th.clamp(self.log_std(latent), self.log_std_min, LOG_STD_MAX)  # type: ignore[operator]
+
+    def sample(self, features: th.Tensor, n_samples: int | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Reparametrised actions in [-1, 1] and their log-probabilities.
+
+        :param features: ``(batch, features_dim)``
+        :param n_samples: actions per state; ``None`` for one, without an axis of its own
+        :return: actions ``(batch[, n_samples], action_dim)`` and log-probabilities ``(batch[, n_samples])``
+        """
+        mean, log_std = self.gaussian_parameters(features)
+        if n_samples is not None:
+            mean = mean.repeat_interleave(n_samples, dim=0)
+            log_std = log_std.repeat_interleave(n_samples, dim=0)
+        actions, log_prob = self._squashed_gaussian().log_prob_from_params(mean, log_std)
+        if n_samples is None:
+            return actions, log_prob
+        return actions.view(-1, n_samples, actions.shape[-1]), log_prob.view(-1, n_samples)
+
+    def log_prob(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param features: ``(batch, features_dim)``
+        :param actions: ``(batch, action_dim)`` in [-1, 1]; moved inside +-0.999, where tanh can be inverted
+        :return: log-probability density of each action, ``(batch,)``
+        """
+        mean, log_std = self.gaussian_parameters(features)
+        distribution = self._squashed_gaussian().proba_distribution(mean, log_std)
+        return distribution.log_prob(actions.clamp(-ACTION_LIMIT, ACTION_LIMIT))
+
+    def _squashed_gaussian(self) -> SquashedDiagGaussianDistribution:
+        assert isinstance(self.action_dist, SquashedDiagGaussianDistribution)
+        return self.action_dist
+
+
+class OfflineCritic(ContinuousCritic):
+    """
+    Critic networks on one encoder, which their loss trains.
+
+    :param layer_norm: put a LayerNorm after each hidden linear layer of the heads
+    :param kwargs: see :class:`stable_baselines3.common.policies.ContinuousCritic`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        n_critics: int = 2,
+        share_features_extractor: bool = True,
+        layer_norm: bool = False,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            net_arch,
+            features_extractor,
+            features_dim,
+            activation_fn,
+            normalize_images,
+            n_critics,
+            share_features_extractor,
+        )
+        if layer_norm:
+            self.q_networks = []
+            for idx in range(n_critics):
+                input_dim = features_dim + get_action_dim(action_space)
+                layers = create_mlp(input_dim, 1, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm])
+                self.add_module(f"qf{idx}", nn.Sequential(*layers))
+                self.q_networks.append(self.get_submodule(f"qf{idx}"))
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
+        :return: features, ``(batch, features_dim)``
+        """
+        return self.extract_features(obs, self.features_extractor)
+
+    def values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Outputs of all critics, for one or for many actions per state.
+
+        The first layer is split into a product with the features, once a state, and one with the actions, once an action:
+        with K actions a state only their sum is K times as large.
+
+        :param features: ``(batch, features_dim)``
+        :param actions: ``(batch, action_dim)``, or ``(batch, K, action_dim)``, in [-1, 1]
+        :return: ``(n_critics, batch)``, or ``(n_critics, batch, K)``
+        """
+        many = actions.dim() == 3
+        outputs = []
+        for q_net in self.q_networks:
+            assert isinstance(q_net, nn.Sequential)
+            first = q_net[0]
+            if many:
+                state_weight, action_weight = first.weight.split([features.shape[1], actions.shape[-1]], dim=1)
+                hidden = F.linear(features, state_weight, first.bias).unsqueeze(1) + F.linear(actions, action_weight)
+                outputs.append(q_net[1:](hidden.flatten(0, 1)).view(actions.shape[:2]))
+            else:
+                outputs.append(q_net(th.cat([features, actions], dim=1)).squeeze(1))
+        return th.stack(outputs)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
+        return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
+
+
+class OfflinePolicy(SACPolicy):
+    """
+    Policy class (with both actor and critic) of the offline actor-critic algorithms. Its parameters bear the names that
+    :class:`stable_baselines3.sac.policies.SACPolicy` gives them.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param share_features_extractor: whether actor and critic share one encoder, trained by the critic alone
+    :param std_min: floor of the actor's standard deviation before the tanh
+    :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
+    :param kwargs: all other arguments of :class:`stable_baselines3.sac.policies.SACPolicy`: ``net_arch``, ``activation_fn``,
+        ``features_extractor_class``, ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
+    """
+
+    actor: OfflineActor
+    critic: OfflineCritic
+    critic_target: OfflineCritic
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        share_features_extractor: bool = True,
+        std_min: float = 0.0,
+        critic_layer_norm: bool = False,
+        **kwargs: Any,
+    ):
+        self.std_min = std_min
+        self.critic_layer_norm = critic_layer_norm
+        super().__init__(
+            observation_space, action_space, lr_schedule, share_features_extractor=share_features_extractor, **kwargs
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.critic = self.make_critic()
+        self.critic_target = self.make_critic()
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target.requires_grad_(False)
+        self.critic_target.set_training_mode(False)
+        self.actor = self.make_actor(self.critic.features_extractor if self.share_features_extractor else None)
+
+        actor_parameters = [
+            parameter
+            for name, parameter in self.actor.named_parameters()
+            if not (self.share_features_extractor and name.startswith("features_extractor."))
+        ]
+        self.actor.optimizer = self._make_optimizer(actor_parameters, lr_schedule)
+        self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
+
+    def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineActor:
+        actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return OfflineActor(**actor_kwargs, std_min=self.std_min, detach_encoder=self.share_features_extractor).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineCritic:
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return OfflineCritic(**critic_kwargs, layer_norm=self.critic_layer_norm).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            share_features_extractor=self.share_features_extractor,
+            std_min=self.std_min,
+            critic_layer_norm=self.critic_layer_norm,
+        )
+        return data
+
+
+MlpPolicy = OfflinePolicy
+
+
+class CnnPolicy(OfflinePolicy):
+    """
+    :class:`OfflinePolicy` for images: the encoder is :class:`~sb3_offline.common.torch_layers.NormalizedNatureCNN`.
+
+    :param kwargs: see :class:`OfflinePolicy`
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] = NormalizedNatureCNN,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class MultiInputPolicy(OfflinePolicy):
+    """
+    :class:`OfflinePolicy` for dict observations: images and vectors are encoded apart and concatenated.
+
+    :param kwargs: see :class:`OfflinePolicy`
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
