@@ -1,0 +1,7 @@
+"""Environments, registered with gymnasium by id; what an environment needs is imported only when it is made."""
+
+import gymnasium as gym
+
+if "MultimodalMetaworld-v0" not in gym.registry:
+    # No max_episode_steps: the environment truncates by itself, after its `episode_length`.
+    gym.register("MultimodalMetaworld-v0", entry_point="sb3_offline.envs.multimodal_metaworld:MultimodalMetaworldEnv")

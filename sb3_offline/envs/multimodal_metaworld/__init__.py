@@ -1,0 +1,12 @@
+"""Five Meta-World tasks on one table. Importing this needs the `metaworld` extra."""
+
+try:
+    import metaworld  # noqa: F401
+except ModuleNotFoundError as error:
+    message = "MultimodalMetaworld-v0 needs Meta-World and MuJoCo: pip install 'sb3-offline[metaworld]'"
+    raise ModuleNotFoundError(message, name=error.name) from error
+
+from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES, MultimodalMetaworldEnv
+from sb3_offline.envs.multimodal_metaworld.tasks import TASKS
+
+__all__ = ["STATE_NAMES", "TASKS", "MultimodalMetaworldEnv"]

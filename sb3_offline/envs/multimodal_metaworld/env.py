@@ -1,0 +1,157 @@
+"""Multimodal Meta-World: five manipulation tasks on one table, none of them named in the observation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS, JITTER, TableScene
+from sb3_offline.envs.multimodal_metaworld.tasks import TASKS, make_tasks
+
+STATE_NAMES = (
+    *("hand_x", "hand_y", "hand_z", "gripper_opening"),
+    *("dial_x", "dial_y", "dial_angle"),
+    *("door_handle_x", "door_handle_y", "door_angle"),
+    *("drawer_x", "drawer_y", "drawer_slide"),
+    *("lever_tip_x", "lever_tip_y", "lever_tip_z", "lever_angle"),
+    *("puck_x", "puck_y", "puck_goal_x", "puck_goal_y"),
+)
+"""What the entries of a state observation are: metres and radians, the gripper's opening in [0, 1]."""
+
+
+class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
+    """
+    Five Meta-World tasks around one arm, as in the CEBORL paper. Every task begins alike, and neither frames nor states tell
+    which one is meant; `task` only chooses the reward and `info["success"]`.
+
+    An action (hand displacement in x, y, z and gripper effort) is repeated `action_repeat` times; reward and success are those
+    of the state at the end. An episode never terminates and is truncated after `episode_length` decisions.
+
+    :param task: one of `TASKS`
+    :param obs_type: "pixels" for (64, 64, 3) uint8 frames, "state" for the vector `STATE_NAMES` (float32)
+    :param render_mode: "rgb_array" or None
+    :param episode_length: decisions in an episode
+    :param action_repeat: control steps of 12.5 ms in a decision
+    :param width: of the pictures of `render()`; the observation stays 64 pixels wide
+    :param height: of the pictures of `render()`
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        task: str = "door-open",
+        obs_type: str = "pixels",
+        render_mode: str | None = None,
+        episode_length: int = 50,
+        action_repeat: int = 4,
+        width: int = 480,
+        height: int = 480,
+    ) -> None:
+        if task not in TASKS:
+            raise ValueError(f"Unknown task {task!r}; choose one of {', '.join(TASKS)}.")
+        if obs_type not in ("pixels", "state"):
+            raise ValueError(f'Unknown obs_type {obs_type!r}; choose "pixels" or "state".')
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f'Unknown render_mode {render_mode!r}; choose "rgb_array" or None.')
+        self.task = task
+        self.obs_type = obs_type
+        self.render_mode = render_mode
+        self.episode_length = episode_length
+        self.action_repeat = action_repeat
+        self.width, self.height = width, height
+        self.scene = TableScene()
+        self._tasks = make_tasks(self.scene)
+        self._task_index = TASKS.index(task)
+        self._n_decisions = 0
+
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.observation_space: spaces.Box
+        if obs_type == "pixels":
+            self.observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+        else:
+            # Wide enough for every reachable value, joint limits being soft.
+            bound = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
+            self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
+
+        model = self.scene.model
+        self._joints = [model.joint(name).qposadr[0] for name in ("knob_Joint_1", "doorjoint", "drawer_slide", "LeverAxis")]
+        self._hand = model.body("hand").id
+        self._claws = [model.body(name).id for name in ("rightclaw", "leftclaw")]
+        self._dial = model.body("dial").id
+        self._drawer = model.body("drawer_link").id
+        self._puck_goal = model.body("puck_goal").id
+        self._door_handle = model.geom("handle").id
+        self._puck = model.geom("puck").id
+        self._lever_tip = model.site("leverStart").id
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param seed: of the objects' places; the same seed gives the same start for every task
+        :param options: not used
+        :return: observation and info, which holds the same success entries as `step`'s
+        """
+        super().reset(seed=seed)
+        self.scene.reset(self.np_random.uniform(-JITTER, JITTER, (len(BODY_POSITIONS), 2)))
+        for task in self._tasks:
+            task.reset_model()
+        self._n_decisions = 0
+        self._solved = False
+        return self._observation(), self._judge(np.zeros(4))[1]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: (4,) float, clipped to [-1, 1]
+        :return: observation, stock reward of the chosen task, False, truncated, and info:
+            `success` (bool), the chosen task's, now; `is_success` (bool), at any decision of this episode so far, which is what
+            SB3 reads at the end (a pulled lever falls back); `task_success` ((5,) bool, now) and `task_reward` ((5,) float32)
+            of all tasks, in the order of `TASKS`
+        """
+        action = np.clip(np.asarray(action, dtype=np.float32), -1.0, 1.0)
+        self.scene.advance(action, self.action_repeat)
+        self._n_decisions += 1
+        reward, info = self._judge(action)
+        return self._observation(), reward, False, self._n_decisions >= self.episode_length, info
+
+    def _judge(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
+        rewards, successes = zip(*(task.judge(action) for task in self._tasks))
+        success = successes[self._task_index]
+        self._solved = self._solved or success
+        info = {
+            "success": success,
+            "is_success": self._solved,
+            "task_success": np.array(successes, dtype=bool),
+            "task_reward": np.array(rewards, dtype=np.float32),
+        }
+        return rewards[self._task_index], info
+
+    def _observation(self) -> np.ndarray:
+        return self._state()
+
+    def _state(self) -> np.ndarray:
+        data = self.scene.data
+        xpos, geoms = data.xpos, data.geom_xpos
+        dial, door, drawer, lever = data.qpos[self._joints]
+        right, left = xpos[self._claws]
+        state = np.array(
+            [
+                *xpos[self._hand],
+                min(np.linalg.norm(right - left) / 0.1, 1.0),
+                *xpos[self._dial, :2],
+                dial,
+                *geoms[self._door_handle, :2],
+                door,
+                xpos[self._drawer, 0],
+                xpos[self._drawer, 1],
+                drawer,
+                *data.site_xpos[self._lever_tip],
+                lever,
+                *geoms[self._puck, :2],
+                *xpos[self._puck_goal, :2],
+            ],
+            dtype=np.float32,
+        )
+        return np.clip(state, self.observation_space.low, self.observation_space.high)
