@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -39,7 +39,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     :param height: of the pictures of `render()`
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(
         self,
@@ -106,9 +106,9 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :param action: (4,) float, clipped to [-1, 1]
         :return: observation, stock reward of the chosen task, False, truncated, and info:
-            `success` (bool), the chosen task's, now; `is_success` (bool), at any decision of this episode so far, which is what
-            SB3 reads at the end (a pulled lever falls back); `task_success` ((5,) bool, now) and `task_reward` ((5,) float32)
-            of all tasks, in the order of `TASKS`
+            `success` (bool), the chosen task's, now;
+            `is_success` (bool), the same at any decision of this episode so far: SB3 reads it at the end, a lever falls back;
+            `task_success` ((5,) bool) and `task_reward` ((5,) float32), of all tasks, now, in the order of `TASKS`
         """
         action = np.clip(np.asarray(action, dtype=np.float32), -1.0, 1.0)
         self.scene.advance(action, self.action_repeat)
@@ -116,17 +116,24 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         reward, info = self._judge(action)
         return self._observation(), reward, False, self._n_decisions >= self.episode_length, info
 
+    def stock_observation(self, task: str) -> np.ndarray:
+        """
+        :param task: one of `TASKS`, not necessarily the chosen one
+        :return: (39,) float64, what that task's scripted policy of Meta-World reads; it holds the goal
+        """
+        return self._tasks[TASKS.index(task)].stock_observation()
+
     def _judge(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
-        rewards, successes = zip(*(task.judge(action) for task in self._tasks))
-        success = successes[self._task_index]
+        verdicts = [task.judge(action) for task in self._tasks]
+        reward, success = verdicts[self._task_index]
         self._solved = self._solved or success
         info = {
             "success": success,
             "is_success": self._solved,
-            "task_success": np.array(successes, dtype=bool),
-            "task_reward": np.array(rewards, dtype=np.float32),
+            "task_success": np.array([verdict[1] for verdict in verdicts]),
+            "task_reward": np.array([verdict[0] for verdict in verdicts], dtype=np.float32),
         }
-        return rewards[self._task_index], info
+        return reward, info
 
     def _observation(self) -> np.ndarray:
         return self._state()
