@@ -1,0 +1,283 @@
+"""A replay buffer over datasets on disk."""
+
+import warnings
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape
+from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.spaces import subspaces
+from sb3_offline.data.storage import RowStore, observation_stores
+
+STATISTICS_BYTES = 1 << 24
+Observations = th.Tensor | TensorDict
+
+
+class OfflineSamples(NamedTuple):
+    """
+    A batch of B transitions; the first six fields are those of SB3's ``ReplayBufferSamples``, for one step.
+
+    :param observations: (B, *shape), channel-first images as a channels-last view of uint8
+    :param actions: (B, A) scaled to [-1, 1]
+    :param next_observations: as ``observations``
+    :param dones: (B, 1) float, 1 where the step terminated; never where it was only truncated
+    :param rewards: (B, 1) float, zeros where the files have none
+    :param discounts: (B, 1) gamma
+    :param next_actions: (B, A) the dataset's action in the next observation, if asked for
+    :param nstep_observations: observation after n' = min(n_steps, steps left in the window's episode) steps; for n_steps > 1
+    :param nstep_actions: (B, A) the dataset's action there, if next actions are asked for
+    :param nstep_discounts: (B, 1) gamma ** n'
+    :param nstep_rewards: (B, 1) sum of gamma ** k * reward over the n' steps
+    :param nstep_dones: (B, 1) float, 1 where the last of the n' steps terminated
+    """
+
+    observations: Observations
+    actions: th.Tensor
+    next_observations: Observations
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor
+    next_actions: th.Tensor | None = None
+    nstep_observations: Observations | None = None
+    nstep_actions: th.Tensor | None = None
+    nstep_discounts: th.Tensor | None = None
+    nstep_rewards: th.Tensor | None = None
+    nstep_dones: th.Tensor | None = None
+
+
+class OfflineReplayBuffer(ReplayBuffer):
+    """
+    A fixed ``ReplayBuffer`` over one or several dataset files.
+
+    It samples uniformly over steps with its own random generator. Windows of several steps never cross an episode. It
+    pickles as its files' paths and its generator.
+
+    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these
+    :param observation_space: the learner's space: as in the files, or with images channel-first
+    :param action_space: the learner's action space; must be that of the files
+    :param device: where samples go
+    :param n_steps: length of the windows of the ``nstep_...`` fields, which exist for n_steps > 1
+    :param gamma: discount of one step
+    :param storage: "memory", "mmap" (contiguous files only), or "auto": the latter where the observations would take more than
+        half of the available memory
+    :param next_actions: give the dataset's next actions too. Then the last step of an episode, which has none, is not
+        sampled, and windows end one step earlier
+    :param seed: seed of the generator
+    """
+
+    def __init__(
+        self,
+        dataset: DatasetSource,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        *,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        storage: Literal["auto", "memory", "mmap"] = "auto",
+        next_actions: bool = False,
+        seed: int | None = None,
+    ):
+        datasets = open_datasets(dataset)
+        n_steps_total = sum(d.n_steps for d in datasets)
+        # Not ReplayBuffer's constructor: it would allocate arrays for the transitions that we hold otherwise
+        BaseBuffer.__init__(self, max(n_steps_total, 1), observation_space, action_space, device)
+        self.full, self.optimize_memory_usage, self.handle_timeout_termination = True, False, False
+        self.n_steps, self.gamma, self.next_actions = n_steps, gamma, next_actions
+        self.datasets = datasets
+        self._transposed = _match_observations(datasets[0], observation_space)
+        if datasets[0].action_space != action_space:
+            problem = f"is {datasets[0].action_space}, but the learner has {action_space}"
+            raise DatasetError(
+                datasets[0].path, "action_space", problem, "Use the environment that the data were collected in"
+            )
+        lengths = np.concatenate([d.lengths for d in datasets])
+        self._index_steps(lengths)
+        self.actions = self._scaled_actions()
+        self.rewards = self._concatenate("rewards", np.zeros(n_steps_total, np.float32))
+        self.dones = self._concatenate("terminated").astype(np.float32)
+        self._stores, self.storage = observation_stores(datasets, storage)
+        self.rng = np.random.default_rng(seed)
+
+    def _concatenate(self, name: str, default: np.ndarray | None = None) -> np.ndarray:
+        if default is not None and name not in self.datasets[0].arrays:
+            return default
+        return np.concatenate([d.arrays[name] for d in self.datasets])
+
+    def _index_steps(self, lengths: np.ndarray) -> None:
+        """For every step its row of observations and the number of steps left from it; and the steps that may be sampled."""
+        n, starts = int(lengths.sum()), np.cumsum(lengths) - lengths
+        step = np.arange(n)
+        self._observation_rows = step + np.repeat(np.arange(len(lengths)), lengths)
+        self._steps_left = np.repeat(starts + lengths, lengths) - step - int(self.next_actions)
+        self._valid = np.flatnonzero(self._steps_left) if self.next_actions else step
+        if len(self._valid) == 0:
+            problem = "holds no episode of two steps or more" if n else "holds no episode"
+            raise DatasetError(self.datasets[0].path, "episodes/length", problem, "Collect or convert the data again")
+        self.buffer_size = len(self._valid)
+
+    def _scaled_actions(self) -> np.ndarray:
+        """As SB3's buffers hold them: [-1, 1] of the space for a Box, integers otherwise."""
+        actions = self._concatenate("actions").reshape(-1, self.action_dim)
+        if not isinstance(self.action_space, spaces.Box):
+            return actions
+        low, high = (b.reshape(-1).astype(np.float64) for b in (self.action_space.low, self.action_space.high))
+        path = self.datasets[0].path
+        if not (np.isfinite(low) & np.isfinite(high)).all():
+            remedy = "Bound the actions of the environment (gymnasium.wrappers.RescaleAction)"
+            raise DatasetError(path, "action_space", "has infinite bounds, so actions cannot be scaled", remedy)
+        scaled = 2.0 * ((actions - low) / (high - low)) - 1.0
+        outside = (np.abs(scaled) > 1 + 1e-4).any(axis=1)
+        if outside.any():
+            warnings.warn(
+                f"{path}: actions: {outside.mean():.1%} of the actions are outside of the action space; they are clipped."
+            )
+        return np.clip(scaled, -1, 1).astype(np.float32)
+
+    def size(self) -> int:
+        """:return: the number of steps that are sampled from"""
+        return self.buffer_size
+
+    def reset(self) -> None:
+        """Do nothing: the data are fixed."""
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """Raise: the data are fixed."""
+        remedy = "Collect new steps in a ReplayBuffer of their own, or write a dataset with DatasetWriter"
+        raise DatasetError("", "OfflineReplayBuffer", "is read-only", remedy)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
+        """
+        :param batch_size: number of transitions B
+        :param env: normalises observations and rewards
+        :return: steps drawn uniformly, with replacement
+        """
+        return self._get_samples(self._valid[self.rng.integers(0, self.buffer_size, batch_size)], env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
+        """
+        :param batch_inds: (B,) step numbers, counted through all files
+        :param env: normalises observations and rewards
+        :return: these transitions
+        """
+        rows = self._observation_rows[batch_inds]
+        samples = OfflineSamples(
+            observations=self._observations(rows, env),
+            actions=self._to_device(self.actions.take(batch_inds, axis=0)),
+            next_observations=self._observations(rows + 1, env),
+            dones=self._column(self.dones[batch_inds]),
+            rewards=self._column(self._normalize_reward(self.rewards[batch_inds], env)),
+            discounts=self._column(np.full(len(batch_inds), self.gamma)),
+        )
+        if self.next_actions:
+            samples = samples._replace(next_actions=self._to_device(self.actions.take(batch_inds + 1, axis=0)))
+        return samples._replace(**self._windows(batch_inds, rows, env)) if self.n_steps > 1 else samples
+
+    def _windows(self, steps: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
+        n = np.minimum(self.n_steps, self._steps_left[steps])
+        offsets = np.arange(self.n_steps)
+        inside = offsets < n[:, None]
+        window = steps[:, None] + np.where(inside, offsets, 0)  # outside: any valid row, since its reward is masked
+        rewards = self._normalize_reward(self.rewards[window], env) * inside * self.gamma**offsets
+        fields = {
+            "nstep_observations": self._observations(rows + n, env),
+            "nstep_discounts": self._column(self.gamma**n),
+            "nstep_rewards": self._column(rewards.sum(axis=1)),
+            "nstep_dones": self._column(self.dones[steps + n - 1]),
+        }
+        if self.next_actions:
+            fields["nstep_actions"] = self._to_device(self.actions.take(steps + n, axis=0))
+        return fields
+
+    def _observations(self, rows: np.ndarray, env: VecNormalize | None) -> Observations:
+        parts = {}
+        for name, space in subspaces(self.observation_space, "observations").items():
+            parts[name.removeprefix("observations/")] = self._wrap(name, self._stores[name].take(rows), space)
+        if env is not None:
+            normalized = env.normalize_obs(parts if isinstance(self.observation_space, spaces.Dict) else parts["observations"])
+            parts = normalized if isinstance(normalized, dict) else {"observations": normalized}
+        tensors = {key: self._to_device(array) for key, array in parts.items()}
+        return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observations"]
+
+    def _wrap(self, name: str, array: np.ndarray, space: spaces.Space) -> np.ndarray:
+        """Rows of a file in the layout and dtype of the learner's space; images turn channel-first as a view."""
+        if name in self._transposed:
+            return array.transpose(0, 3, 1, 2)
+        return array.reshape(len(array), *_plain_shape(space)).astype(space.dtype, copy=False)
+
+    def _to_device(self, array: np.ndarray) -> th.Tensor:
+        return th.as_tensor(array, device=self.device)  # no copy on the CPU: all arrays here are fresh
+
+    def _column(self, values: np.ndarray) -> th.Tensor:
+        return self._to_device(values.astype(np.float32).reshape(-1, 1))
+
+    def observation_statistics(self) -> Any:
+        """
+        Moments of all observations in the files, the last ones of episodes too, e.g. for ``VecNormalize.obs_rms``.
+
+        :return: (mean, variance, count) with mean and variance float64 of the learner's shape; for a Dict space a dict of such
+        """
+        plain = subspaces(self.observation_space, "observations")
+        moments = {n.removeprefix("observations/"): self._moments(n, self._stores[n], s) for n, s in plain.items()}
+        return moments if isinstance(self.observation_space, spaces.Dict) else moments["observations"]
+
+    def _moments(self, name: str, store: RowStore, space: spaces.Space) -> tuple[np.ndarray, np.ndarray, int]:
+        mean, squares, count = np.zeros(()), np.zeros(()), 0
+        for part in store.parts:
+            rows = max(STATISTICS_BYTES // max(part[:1].nbytes, 1), 1)
+            for first in range(0, len(part), rows):
+                piece = self._wrap(name, part[first : first + rows], space).astype(np.float64)
+                delta, total = piece.mean(axis=0) - mean, count + len(piece)
+                # Moments of two sets joined (Chan et al.): the sum of squares alone would cancel for far-off means
+                squares = squares + ((piece - piece.mean(axis=0)) ** 2).sum(axis=0) + delta**2 * count * len(piece) / total
+                mean = mean + delta * len(piece) / total
+                count = total
+        return mean, squares / count, count
+
+    def get_rng_state(self) -> dict[str, Any]:
+        """:return: the generator's state, for an exact resume"""
+        return dict(self.rng.bit_generator.state)
+
+    def set_rng_state(self, state: dict[str, Any]) -> None:
+        """:param state: what ``get_rng_state`` gave"""
+        self.rng.bit_generator.state = state
+
+    def __getstate__(self) -> dict[str, Any]:
+        options = {"n_steps": self.n_steps, "gamma": self.gamma, "storage": self.storage, "next_actions": self.next_actions}
+        arguments = (self.datasets, self.observation_space, self.action_space, str(self.device))
+        return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["arguments"], **state["options"])  # type: ignore[misc]
+        self.set_rng_state(state["rng_state"])
+
+
+def _plain_shape(space: spaces.Space) -> tuple[int, ...]:
+    """:return: SB3's shape of one observation of a space that is not a Dict: (1,) for Discrete"""
+    return get_obs_shape(space)  # type: ignore[return-value]
+
+
+def _match_observations(dataset: OfflineDataset, space: spaces.Space) -> set[str]:
+    """:return: names of the arrays that are channel-last images here and channel-first ones for the learner"""
+    stored, wanted = subspaces(dataset.observation_space, "observations"), subspaces(space, "observations")
+    if stored.keys() != wanted.keys():
+        problem = f"is {dataset.observation_space}, but the learner has {space}"
+        raise DatasetError(dataset.path, "observation_space", problem, "Use the environment that the data were collected in")
+    transposed = set()
+    for name, part in wanted.items():
+        shape, learner = tuple(stored[name].shape or ()), tuple(part.shape or ())
+        if len(shape) == 3 and shape != learner and (shape[2], shape[0], shape[1]) == learner:
+            transposed.add(name)
+        elif shape != learner or np.dtype(stored[name].dtype).kind != np.dtype(part.dtype).kind:
+            problem = f"is {stored[name]}, but the learner has {part}"
+            raise DatasetError(
+                dataset.path, name, problem, "Use the environment (and wrappers) that the data were collected in"
+            )
+    return transposed

@@ -1,0 +1,63 @@
+"""Files replaced whole or not at all, and HDF5 files opened with errors that name the remedy."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+
+from sb3_offline.data.errors import DatasetError
+
+
+def temporary_path(path: Path) -> Path:
+    """
+    :param path: the file that is to be written
+    :return: its temporary neighbour; always the same, so that what a killed process left is found and overwritten
+    """
+    return path.with_name(f".{path.name}.tmp")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """
+    Write a file so that a reader, or a process started after a kill or a power cut, sees the old or the new one whole.
+
+    :param path: the file to create or replace
+    :return: context manager giving the temporary path to write to; it replaces ``path`` when the block ends well
+    """
+    path = Path(os.path.realpath(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_path(path)
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        if os.name == "posix":  # the rename itself lives in the directory, which other systems cannot open
+            _sync(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def open_hdf5(path: str | os.PathLike) -> h5py.File:
+    """
+    :param path: an HDF5 file
+    :return: the file opened for reading, without HDF5's file lock: a dataset may be read while a writer appends to it
+    """
+    if not os.path.isfile(path):
+        raise DatasetError(path, "file", "does not exist", "Check the path")
+    try:
+        return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        if "truncated file" in str(error):
+            raise DatasetError(path, "file", "is truncated", "Copy or download it again: its end is missing") from error
+        problem = "cannot be read as HDF5 (" + str(error).strip() + ")"
+        raise DatasetError(path, "file", problem, "Check that this is a complete .h5 or .hdf5 file") from error

@@ -1,0 +1,185 @@
+"""
+The dataset format, version 1, as code; docs/dataset_format.md says the same in words.
+
+One HDF5 file holds E episodes of together N steps. Arrays are flat over all steps, and each episode has one more row of
+observations than it has steps, so that no observation is stored twice.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import h5py
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.spaces import space_from_json, space_to_json, subspaces
+
+FORMAT = "sb3-offline-dataset"
+FORMAT_VERSION = 1
+# About this much of an array becomes one chunk of compressed storage: 50 frames of 64x64x3, so that gzip finds the
+# previous frames in its window, and few enough bytes for HDF5's default chunk cache of 1 MiB.
+CHUNK_BYTES = 50 * 64 * 64 * 3
+
+Storage = Literal["contiguous", "compressed"]
+
+
+class Field(NamedTuple):
+    """
+    One array of the file.
+
+    :param per: what one row belongs to: "episode" (E rows), "step" (N rows) or "observation" (N + E rows)
+    :param shape: shape of one row
+    :param dtype: dtype of the values
+    """
+
+    per: Literal["episode", "step", "observation"]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    def rows(self, n_episodes: int, n_steps: int) -> int:
+        """:return: the number of rows for so many episodes and steps"""
+        return {"episode": n_episodes, "step": n_steps, "observation": n_steps + n_episodes}[self.per]
+
+    @property
+    def row_bytes(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+
+
+@dataclass
+class Header:
+    """
+    What a file says about its arrays: its attributes, and which of the optional arrays it has.
+
+    :param env_id: gymnasium id, "" where there is none
+    :param env_kwargs: keyword arguments of the environment (JSON)
+    :param provenance: where the data come from: program, command, seed, versions, policy, ... (JSON)
+    :param sources: labels of the episodes' sources, e.g. the scripted policy; ``None``: episodes have none
+    :param rewards: whether the file has rewards
+    :param success: whether the file has success labels
+    :param extras: further arrays with one row per step: name to (shape of one row, dtype)
+    """
+
+    observation_space: spaces.Space
+    action_space: spaces.Space
+    env_id: str = ""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    sources: list[str] | None = None
+    rewards: bool = True
+    success: bool = True
+    extras: Mapping[str, tuple[tuple[int, ...], Any]] = field(default_factory=dict)
+
+    def fields(self) -> dict[str, Field]:
+        """:return: all arrays of the file by their HDF5 name, apart from ``n_episodes``"""
+        episode_dtypes = {"length": np.int64, "seed": np.int64}
+        if self.sources is not None:
+            episode_dtypes["source"] = np.int16
+        fields = {f"episodes/{name}": Field("episode", (), np.dtype(dtype)) for name, dtype in episode_dtypes.items()}
+        for name, space in subspaces(self.observation_space, "observations").items():
+            fields[name] = Field("observation", tuple(space.shape or ()), np.dtype(space.dtype))
+        action_dtype = np.float32 if isinstance(self.action_space, spaces.Box) else self.action_space.dtype
+        fields["actions"] = Field("step", tuple(self.action_space.shape or ()), np.dtype(action_dtype))
+        if self.rewards:
+            fields["rewards"] = Field("step", (), np.dtype(np.float32))
+        for name in ("terminated", "truncated") + (("success",) if self.success else ()):
+            fields[name] = Field("step", (), np.dtype(bool))
+        for name, (shape, dtype) in self.extras.items():
+            fields[f"extras/{name}"] = Field("step", tuple(shape), np.dtype(dtype))
+        return fields
+
+    def attributes(self) -> dict[str, Any]:
+        """:return: the attributes of the file"""
+        attributes = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "observation_space": space_to_json(self.observation_space),
+            "action_space": space_to_json(self.action_space),
+            "env_id": self.env_id,
+            "env_kwargs": json.dumps(self.env_kwargs),
+            "provenance": json.dumps(self.provenance),
+        }
+        return attributes if self.sources is None else {**attributes, "sources": json.dumps(self.sources)}
+
+
+def read_header(file: h5py.File, path: str | os.PathLike) -> Header:
+    """
+    :param file: an open file of this format
+    :param path: for error messages
+    :return: its header; raises ``DatasetError`` on another format, a newer version, or unreadable attributes
+    """
+    if file.attrs.get("format") != FORMAT:
+        problem = f"is {file.attrs.get('format')!r}, expected {FORMAT!r}"
+        remedy = "Give a dataset written by DatasetWriter, or a D4RL-style file (observations, actions, terminals)"
+        raise DatasetError(path, "attribute format", problem, remedy)
+    version = file.attrs.get("format_version")
+    if version != FORMAT_VERSION:
+        remedy = (
+            "Update sb3-offline" if isinstance(version, np.integer) and version > FORMAT_VERSION else "Convert the file again"
+        )
+        raise DatasetError(path, "attribute format_version", f"is {version}, this release reads {FORMAT_VERSION}", remedy)
+
+    def attribute(name: str, decode: Any) -> Any:
+        try:
+            return decode(file.attrs[name])
+        except (KeyError, TypeError, ValueError) as error:
+            problem = "is missing" if name not in file.attrs else f"cannot be understood ({error})"
+            raise DatasetError(path, f"attribute {name}", problem, "Write the file again with DatasetWriter") from error
+
+    extras = file.get("extras", {})
+    return Header(
+        observation_space=attribute("observation_space", space_from_json),
+        action_space=attribute("action_space", space_from_json),
+        env_id=attribute("env_id", str),
+        env_kwargs=attribute("env_kwargs", json.loads),
+        provenance=attribute("provenance", json.loads),
+        sources=attribute("sources", json.loads) if "sources" in file.attrs else None,
+        rewards="rewards" in file,
+        success="success" in file,
+        extras={name: (array.shape[1:], array.dtype) for name, array in extras.items()},
+    )
+
+
+def create_file(
+    path: Path, header: Header, n_episodes: int, n_steps: int, *, committed: int, storage: Storage = "contiguous"
+) -> None:
+    """
+    Create a file with room for so many episodes and steps. Contiguous arrays are given their place and left unwritten: they
+    take no space on disk before rows are written to them.
+
+    :param path: file to create (or overwrite)
+    :param header: attributes and fields
+    :param n_episodes: room for episodes
+    :param n_steps: room for steps
+    :param committed: what ``n_episodes`` in the file says: how many episodes exist
+    :param storage: "contiguous" (for training) or "compressed" (for keeping and sending)
+    """
+    # Arrays at whole pages: a memory-mapped row then touches no more pages than it must.
+    with h5py.File(path, "w", locking=False, alignment_threshold=4096, alignment_interval=4096) as file:
+        for name, value in header.attributes().items():
+            file.attrs[name] = value
+        for name, spec in header.fields().items():
+            _create_array(file, name, (spec.rows(n_episodes, n_steps), *spec.shape), spec, storage)
+        _create_array(file, "n_episodes", (), Field("episode", (), np.dtype(np.int64)), "contiguous")
+        file["n_episodes"][()] = committed
+
+
+def _create_array(file: h5py.File, name: str, shape: tuple[int, ...], spec: Field, storage: Storage) -> None:
+    if storage == "compressed" and 0 not in shape:
+        chunk = min(max(CHUNK_BYTES // max(spec.row_bytes, 1), 1), shape[0])
+        options: dict[str, Any] = {"chunks": (chunk, *spec.shape), "compression": "gzip", "shuffle": True}
+        file.create_dataset(name, shape, spec.dtype, **options)
+        return
+    plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plist.set_layout(h5py.h5d.CONTIGUOUS)
+    plist.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    plist.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    group, _, leaf = name.rpartition("/")
+    parent = file.require_group(group) if group else file
+    h5py.h5d.create(
+        parent.id, leaf.encode(), h5py.h5t.py_create(spec.dtype, logical=True), h5py.h5s.create_simple(shape), plist
+    )

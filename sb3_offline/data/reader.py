@@ -1,0 +1,218 @@
+"""Datasets opened for reading, with everything checked that can be checked without touching the frames."""
+
+import glob
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.data.d4rl import is_d4rl, read_d4rl
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import open_hdf5
+from sb3_offline.data.format import Field, Header, Storage, read_header
+from sb3_offline.data.spaces import subspaces
+
+
+class HDF5Array:
+    """
+    An array inside of an HDF5 file, read at each access. It keeps no file open, so threads and processes may share it.
+
+    :param path: the file
+    :param name: name of the array in it
+    :param rows: so many rows exist
+    :param spec: what they hold
+    """
+
+    def __init__(self, path: Path, name: str, rows: int, spec: Field):
+        self.path, self.name = path, name
+        self.shape, self.dtype = (rows, *spec.shape), spec.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: Any) -> np.ndarray:
+        """
+        :param rows: one index, a slice, or an array of indices
+        :return: these rows. Scattered indices are slow (whole chunks are decompressed): convert the file for training
+        """
+        with open_hdf5(self.path) as file:
+            array = file[self.name]
+            if isinstance(rows, slice):
+                return array[slice(*rows.indices(len(self)))]
+            indices, inverse = np.unique(np.arange(len(self))[rows], return_inverse=True)
+            return array[indices][inverse.reshape(np.shape(rows))]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self[:].astype(dtype or self.dtype, copy=False)
+
+
+ArrayLike = np.ndarray | HDF5Array
+
+
+class OfflineDataset:
+    """
+    A dataset file of format version 1, or a D4RL-style HDF5 file. Opening checks it and raises ``DatasetError`` with the
+    file, the field and the remedy.
+
+    Arrays are flat over all steps; episode e has its steps at ``step_starts[e] + arange(lengths[e])`` and its
+    observations, one more, at ``observation_starts[e] + arange(lengths[e] + 1)``.
+
+    - ``observation_space``, ``action_space``, ``env_id``, ``env_kwargs``, ``provenance``, ``sources`` (labels)
+    - ``n_episodes`` (E), ``n_steps`` (N), ``lengths``, ``step_starts``, ``observation_starts``, ``seeds`` (E,) int64,
+      ``source`` (E,) int16 or ``None``: index into ``sources``
+    - ``observations`` (N + E, *shape), a dict of such for a Dict space: a read-only memory map in contiguous storage,
+      an ``HDF5Array`` in compressed storage. ``extras``: likewise, (N, ...) by name
+    - ``actions`` (N, *shape) float32 in environment units, ``rewards`` (N,) float32 or ``None``, ``terminated``,
+      ``truncated`` (N,) bool, ``success`` (N,) bool or ``None``
+    - ``storage``: "contiguous", "compressed", or "memory" (D4RL)
+
+    It pickles as its path.
+
+    :param path: the file
+    :param observation_space: space of a D4RL-style file, which declares none (default: unbounded, from the data)
+    :param action_space: likewise (default: [-1, 1])
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        *,
+        observation_space: spaces.Space | None = None,
+        action_space: spaces.Space | None = None,
+    ):
+        self.path = Path(path).absolute()
+        self._given_spaces = {"observation_space": observation_space, "action_space": action_space}
+        with open_hdf5(self.path) as file:
+            if is_d4rl(file):
+                header, arrays = read_d4rl(file, self.path, observation_space, action_space)
+                self.storage: Storage | str = "memory"
+                n_episodes = len(arrays["episodes/length"])
+            else:
+                header = read_header(file, self.path)
+                n_episodes, arrays = self._read_arrays(file, header)
+                self.storage = "contiguous" if file["actions"].chunks is None else "compressed"
+        self.header = header
+        self.observation_space, self.action_space = header.observation_space, header.action_space
+        self.env_id, self.env_kwargs, self.provenance = header.env_id, header.env_kwargs, header.provenance
+        self.sources: list[str] = header.sources or []
+        self.n_episodes = n_episodes
+        self.lengths: np.ndarray = np.asarray(arrays["episodes/length"])
+        self.n_steps = int(self.lengths.sum())
+        self.step_starts = np.cumsum(self.lengths) - self.lengths
+        self.observation_starts = self.step_starts + np.arange(n_episodes)
+        self.seeds, self.source = arrays["episodes/seed"], arrays.get("episodes/source")
+        self.observations: ArrayLike | dict[str, ArrayLike] = arrays.get("observations", {})
+        if isinstance(self.observation_space, spaces.Dict):
+            self.observations = {key: arrays[f"observations/{key}"] for key in self.observation_space}
+        self.actions, self.rewards = arrays["actions"], arrays.get("rewards")
+        self.terminated, self.truncated, self.success = (arrays.get(k) for k in ("terminated", "truncated", "success"))
+        self.extras = {name: arrays[f"extras/{name}"] for name in header.extras}
+        self.arrays = arrays
+        self._check(arrays)
+
+    def _read_arrays(self, file: h5py.File, header: Header) -> tuple[int, dict[str, Any]]:
+        """Map or read the committed rows of every array. A file that a killed writer left has room for more than these."""
+        fields = header.fields()
+        for name in ["n_episodes", *fields]:
+            if not isinstance(file.get(name), h5py.Dataset):
+                raise DatasetError(self.path, name, "is missing", "Write the file again with DatasetWriter")
+        n_episodes, room = int(file["n_episodes"][()]), len(file["episodes/length"])
+        if not 0 <= n_episodes <= room:
+            problem = f"is {n_episodes}, but episodes/length has {room} rows"
+            raise DatasetError(self.path, "n_episodes", problem, "The file is damaged: take a copy, or write it again")
+        lengths = file["episodes/length"][:n_episodes]
+        if n_episodes and lengths.min() < 1:
+            problem = f"holds an episode of {lengths.min()} steps"
+            raise DatasetError(self.path, "episodes/length", problem, "Leave empty episodes out")
+        n_steps = int(lengths.sum())
+        arrays = {}
+        for name, spec in fields.items():
+            array, rows = file[name], spec.rows(n_episodes, n_steps)
+            if array.dtype != spec.dtype or array.shape[1:] != spec.shape:
+                problem = f"holds rows of shape {array.shape[1:]} and dtype {array.dtype}, expected {spec.shape} {spec.dtype}"
+                raise DatasetError(self.path, name, problem, "Write the file again with DatasetWriter")
+            if len(array) < rows:
+                problem = f"has {len(array)} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
+                raise DatasetError(self.path, name, problem, "Leave out incomplete episodes, or write the file again")
+            arrays[name] = self._read_array(array, name, spec, rows)
+        return n_episodes, arrays
+
+    def _read_array(self, array: h5py.Dataset, name: str, spec: Field, rows: int) -> ArrayLike:
+        offset = array.id.get_offset()
+        if offset is not None and rows * spec.row_bytes > 0:
+            mapped = np.memmap(self.path, spec.dtype, "r", offset, (rows, *spec.shape))
+            return mapped.view(np.ndarray)  # a plain array over the map: np.memmap itself makes every indexing slower
+        if name.startswith(("observations", "extras/")) and rows:
+            return HDF5Array(self.path, name, rows, spec)
+        return array[:rows]
+
+    def _check(self, arrays: dict[str, Any]) -> None:
+        """Check the values of the small arrays. Integer frames cannot hold NaN and are left alone, whatever their size."""
+        vectors = [n for n, s in subspaces(self.observation_space, "observations").items() if len(s.shape or ()) <= 1]
+        for name in ["actions", "rewards", *vectors]:
+            array = arrays.get(name)
+            if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
+                row = int(np.argmin(np.isfinite(array).reshape(len(array), -1).all(axis=1)))
+                remedy = "Leave that episode out when writing the file"
+                raise DatasetError(self.path, name, f"holds NaN or infinity, first in row {row}", remedy)
+        inside = np.ones(self.n_steps, dtype=bool)
+        inside[self.step_starts + self.lengths - 1] = False
+        for name in ("terminated", "truncated"):
+            if arrays[name][inside].any():
+                row = int(np.argmax(arrays[name] & inside))
+                remedy = "Split the episode there: it ends with the step that terminates or truncates it"
+                raise DatasetError(self.path, name, f"is true before the last step of an episode (row {row})", remedy)
+        if self.source is not None and self.n_episodes:
+            if self.source.min() < 0 or self.source.max() >= len(self.sources):
+                problem = f"has indices up to {self.source.max()}, but there are {len(self.sources)} labels"
+                raise DatasetError(self.path, "episodes/source", problem, "Write the file again with all labels")
+
+    def __reduce__(self) -> tuple:
+        return _reopen, (self.path, self._given_spaces)
+
+
+def _reopen(path: Path, given_spaces: dict[str, Any]) -> OfflineDataset:
+    return OfflineDataset(path, **given_spaces)
+
+
+DatasetSource = str | os.PathLike | OfflineDataset | Sequence[str | os.PathLike | OfflineDataset]
+
+
+def open_datasets(source: DatasetSource) -> list[OfflineDataset]:
+    """
+    :param source: a path, a glob pattern, an open dataset, or a sequence of these
+    :return: the datasets, those of a pattern sorted by name; raises ``DatasetError`` where there is none, or where two do not
+        have the same spaces and the same optional arrays
+    """
+    datasets = list(_open_each(source))
+    if not datasets:
+        raise DatasetError("", "dataset", f"{source!r} names no file", "Give at least one dataset file")
+    first = datasets[0]
+    for other in datasets[1:]:
+        for name in ("observation_space", "action_space"):
+            if getattr(other, name) != getattr(first, name):
+                problem = f"is {getattr(other, name)}, but {getattr(first, name)} in {first.path}"
+                raise DatasetError(other.path, name, problem, "Give files of one environment, or train on them apart")
+        if (other.rewards is None) != (first.rewards is None):
+            with_rewards, without = (first, other) if other.rewards is None else (other, first)
+            problem = f"are missing, but {with_rewards.path} has them"
+            raise DatasetError(without.path, "rewards", problem, "Give files that all have rewards, or none of them")
+    return datasets
+
+
+def _open_each(source: DatasetSource) -> Iterator[OfflineDataset]:
+    if isinstance(source, OfflineDataset):
+        yield source
+    elif isinstance(source, str | os.PathLike):
+        pattern = os.path.expanduser(source)
+        paths = sorted(glob.glob(pattern, recursive=True)) if not os.path.exists(pattern) else [pattern]
+        if not paths and glob.has_magic(pattern):
+            raise DatasetError(pattern, "dataset", "matches no file", "Check the pattern")
+        yield from (OfflineDataset(path) for path in paths or [pattern])
+    else:
+        for part in source:
+            yield from _open_each(part)

@@ -1,0 +1,158 @@
+"""Gymnasium spaces as JSON, and arrays checked against spaces."""
+
+import json
+import os
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.data.errors import DatasetError
+
+
+def space_to_json(space: spaces.Space) -> str:
+    """
+    :param space: a Box, Discrete, MultiDiscrete or MultiBinary space, or a Dict of these
+    :return: JSON text; ``space_from_json`` gives an equal space back
+    """
+    return json.dumps(_encode(space))
+
+
+def space_from_json(text: str) -> spaces.Space:
+    """
+    :param text: what ``space_to_json`` wrote; anything else raises ``ValueError``, ``KeyError`` or ``TypeError``
+    :return: the space
+    """
+    return _decode(json.loads(text))
+
+
+def _encode(space: spaces.Space) -> dict[str, Any]:
+    if isinstance(space, spaces.Box):
+        bounds = {"low": _encode_bound(space.low), "high": _encode_bound(space.high)}
+        return {"type": "Box", "shape": list(space.shape), "dtype": str(space.dtype), **bounds}
+    if isinstance(space, spaces.Discrete):
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+    if isinstance(space, spaces.MultiDiscrete):
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
+    if isinstance(space, spaces.MultiBinary):
+        return {"type": "MultiBinary", "n": [int(n) for n in space.shape]}
+    if isinstance(space, spaces.Dict) and not any(isinstance(s, spaces.Dict) or "/" in k for k, s in space.items()):
+        return {"type": "Dict", "spaces": {key: _encode(subspace) for key, subspace in space.items()}}
+    supported = "Box, Discrete, MultiDiscrete, MultiBinary and flat Dict spaces (no '/' in keys)"
+    raise DatasetError("", "space", f"{space} cannot be stored", f"The format holds {supported}; wrap the environment")
+
+
+def _decode(data: dict[str, Any]) -> spaces.Space:
+    kind = data["type"]
+    if kind == "Box":
+        shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+        low, high = (np.broadcast_to(np.array(data[k], dtype=np.float64), shape).astype(dtype) for k in ("low", "high"))
+        return spaces.Box(low, high, shape, dtype.type)
+    if kind == "Discrete":
+        return spaces.Discrete(data["n"], start=data["start"])
+    if kind == "MultiDiscrete":
+        return spaces.MultiDiscrete(data["nvec"])
+    if kind == "MultiBinary":
+        return spaces.MultiBinary(data["n"])
+    if kind == "Dict":
+        return spaces.Dict(OrderedDict((key, _decode(value)) for key, value in data["spaces"].items()))
+    raise ValueError(f"unknown space type {kind!r}")
+
+
+def _encode_bound(bound: np.ndarray) -> Any:
+    """One number where all are equal. Infinities become strings, since JSON has none (NumPy parses them back)."""
+    uniform = bound.size > 0 and (bound == bound.flat[0]).all()
+    values = np.asarray(bound.flat[0] if uniform else bound).astype(object)
+
+    def encode(value: Any) -> Any:
+        return str(float(value)) if np.isinf(value) else value
+
+    return np.vectorize(encode, otypes=[object])(values).tolist() if values.size else []
+
+
+def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
+    """
+    :param space: any space
+    :param name: how the arrays of this space are called, e.g. "observations"
+    :return: the plain spaces by array name: ``{name: space}``, or ``{name/key: subspace}`` for a Dict space
+    """
+    if isinstance(space, spaces.Dict):
+        return {f"{name}/{key}": subspace for key, subspace in space.items()}
+    return {name: space}
+
+
+def check_observations(
+    value: Any, space: spaces.Space, rows: int | None, file: str | os.PathLike, name: str = "observations"
+) -> dict[str, np.ndarray]:
+    """
+    Check rows of observations against their space.
+
+    :param value: array of shape (rows, *space.shape), or a dict of such for a Dict space
+    :param space: the space of one observation
+    :param rows: expected number of rows, ``None`` for any
+    :param file: for the error message
+    :param name: how these arrays are called
+    :return: arrays of the space's dtype by their names, as in ``subspaces``
+    """
+    parts = {name: value}
+    if isinstance(space, spaces.Dict):
+        if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
+            problem = f"is not a dict with the keys {sorted(space.spaces)}"
+            raise DatasetError(file, name, problem, "Give one array for each key of the Dict space")
+        parts = {f"{name}/{key}": part for key, part in value.items()}
+    checked = {}
+    for field, subspace in subspaces(space, name).items():
+        shape, dtype = tuple(subspace.shape or ()), np.dtype(subspace.dtype)
+        checked[field] = check_rows(parts[field], shape, dtype, rows, file, field)
+        # Only images: the bounds of other observations are often a guess that environments do not keep
+        if isinstance(subspace, spaces.Box) and dtype.kind == "f" and len(shape) == 3 and checked[field].size:
+            _check_range(checked[field], subspace.low.min(), subspace.high.max(), file, field)
+    return checked
+
+
+def check_rows(
+    value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
+) -> np.ndarray:
+    """
+    Check rows of one array, and convert them to its dtype where that changes no value by more than rounding.
+
+    :param value: array-like of shape (rows, *shape)
+    :param shape: shape of one row
+    :param dtype: dtype of the result
+    :param rows: expected number of rows, ``None`` for any
+    :param file: for the error message
+    :param field: for the error message
+    :return: array of shape (rows, *shape); raises ``DatasetError`` on another shape or dtype, values outside of the
+        dtype's range, NaN or infinity
+    """
+    array = np.asarray(value)
+    if array.ndim == 0 or array.shape[1:] != shape or rows not in (None, len(array)):
+        wanted = ("n" if rows is None else rows, *shape)
+        problem = f"has shape {array.shape}, expected ({', '.join(map(str, wanted))}{',' if not shape else ''})"
+        raise DatasetError(file, field, problem, "Give rows of this shape (and T + 1 rows of observations for T actions)")
+    if array.dtype.kind not in "iubf" or (array.dtype.kind == "f" and dtype.kind in "iu"):
+        remedy = "Convert it first (floats in [0, 1] to uint8: (255 * x).round().astype(np.uint8))"
+        raise DatasetError(file, field, f"has dtype {array.dtype}, expected {dtype}", remedy)
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):  # an overflow becomes an infinity, which is reported
+            array = array.astype(dtype, copy=False)
+        finite = np.isfinite(array)
+        if not finite.all():
+            row = int(np.argmin(finite.reshape(len(array), -1).all(axis=1)))
+            raise DatasetError(file, field, f"holds NaN or infinity, first in row {row}", "Repair it or leave it out")
+    elif array.dtype != dtype and array.size:
+        if dtype.kind == "b":
+            if not ((array == 0) | (array == 1)).all():
+                raise DatasetError(file, field, "holds values other than 0 and 1", "Give flags of true and false")
+        else:
+            _check_range(array, np.iinfo(dtype).min, np.iinfo(dtype).max, file, field)
+    return array.astype(dtype, copy=False)
+
+
+def _check_range(array: np.ndarray, low: Any, high: Any, file: str | os.PathLike, field: str) -> None:
+    smallest, largest = array.min(), array.max()
+    if smallest < low or largest > high:
+        problem = f"holds values in [{smallest}, {largest}], outside of the range [{low}, {high}]"
+        raise DatasetError(file, field, problem, "Rescale the values to the space, or declare the space that they have")

@@ -1,0 +1,99 @@
+"""Rows of observations from one or several files, out of memory or out of a memory map."""
+
+import os
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import ArrayLike, OfflineDataset
+from sb3_offline.data.spaces import subspaces
+
+READ_BYTES = 1 << 26
+
+
+class RowStore:
+    """
+    The rows of one array, numbered through several parts.
+
+    :param parts: arrays of the same row shape and dtype: one per file, or a single one
+    """
+
+    def __init__(self, parts: Sequence[np.ndarray]):
+        self.parts = list(parts)
+        self.ends = np.cumsum([len(part) for part in self.parts])
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def take(self, rows: np.ndarray) -> np.ndarray:
+        """
+        :param rows: (B,) row numbers
+        :return: (B, *shape) a copy of these rows
+        """
+        if len(self.parts) == 1:
+            return self.parts[0].take(rows, axis=0)
+        part_of_row = np.searchsorted(self.ends, rows, side="right")
+        out = np.empty((len(rows), *self.parts[0].shape[1:]), self.parts[0].dtype)
+        for part in np.unique(part_of_row):
+            here = part_of_row == part
+            first_row = self.ends[part] - len(self.parts[part])
+            out[here] = self.parts[part].take(rows[here] - first_row, axis=0)
+        return out
+
+
+def observation_stores(
+    datasets: Sequence[OfflineDataset], storage: Literal["auto", "memory", "mmap"]
+) -> tuple[dict[str, RowStore], Literal["memory", "mmap"]]:
+    """
+    :param datasets: datasets of the same spaces
+    :param storage: "memory" reads all observations once, "mmap" leaves them on disk and needs contiguous storage, "auto" maps
+        where they would take more than half of the memory that is available now
+    :return: the observations by array name (``observations`` or ``observations/key``), and the storage that was chosen
+    """
+    names = list(subspaces(datasets[0].observation_space, "observations"))
+    columns: dict[str, list[ArrayLike]] = {name: [dataset.arrays[name] for dataset in datasets] for name in names}
+    if storage == "auto":
+        size = sum(len(array) * _row_bytes(array) for column in columns.values() for array in column)
+        storage = "mmap" if size > available_memory() / 2 else "memory"
+    if storage == "mmap":
+        for dataset in datasets:
+            if dataset.storage == "compressed":
+                problem = "is compressed and cannot be memory-mapped"
+                remedy = "Convert it to contiguous storage (sb3-offline convert), or use storage='memory' if it fits"
+                raise DatasetError(dataset.path, "observations", problem, remedy)
+        return {name: RowStore(column) for name, column in columns.items()}, "mmap"  # type: ignore[arg-type]
+    return {name: RowStore([_read_all(column)]) for name, column in columns.items()}, "memory"
+
+
+def available_memory() -> int:
+    """:return: bytes of memory that this process may still take, as far as the system says"""
+    available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 1 << 33
+    try:
+        with open("/proc/meminfo") as file:
+            values = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in file}
+        available = values.get("MemAvailable", available)
+        with open("/sys/fs/cgroup/memory.max") as limit, open("/sys/fs/cgroup/memory.current") as current:
+            return min(available, int(limit.read()) - int(current.read()))  # a container's limit; "max" where it has none
+    except (OSError, ValueError):
+        return available
+
+
+def _row_bytes(array: ArrayLike) -> int:
+    return int(np.prod(array.shape[1:], dtype=np.int64)) * array.dtype.itemsize
+
+
+def _read_all(column: Sequence[ArrayLike]) -> np.ndarray:
+    """Read the arrays one after another into a single one, by pieces: a compressed array never exists twice in memory."""
+    if len(column) == 1 and isinstance(column[0], np.ndarray) and column[0].base is None:
+        return column[0]  # in memory already
+    out = np.empty((sum(len(array) for array in column), *column[0].shape[1:]), column[0].dtype)
+    start = 0
+    step = max(READ_BYTES // max(_row_bytes(column[0]), 1), 1)
+    for array in column:
+        for first in range(0, len(array), step):
+            piece = array[first : min(first + step, len(array))]
+            out[start : start + len(piece)] = piece
+            start += len(piece)
+    return out
