@@ -1,0 +1,166 @@
+"""Success examples: observations of a solved task, from whatever file or folder a user has them in."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import open_hdf5, replacing
+from sb3_offline.data.spaces import check_observations, space_to_json
+
+EXAMPLES_FORMAT = "sb3-offline-examples"
+EXAMPLES_VERSION = 1
+PICTURES = (".png", ".jpg", ".jpeg")
+# Modes of Pillow with 8 bits a channel; it would clip others (16-bit PNGs) to white
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+def load_examples(
+    source: str | os.PathLike | np.ndarray | Mapping[str, np.ndarray], observation_space: spaces.Space
+) -> Observations:
+    """
+    Read success examples, in any form, as observations of a space.
+
+    :param source: a file of ``save_examples``; an ``.npz`` (``observations``, or its only array; for a Dict space an array for
+        each key); a ``.npy``; an array, or a dict of arrays; or a folder of PNG or JPEG pictures, taken in the order of their
+        names and resized (the whole picture, so crop it before where its proportions differ)
+    :param observation_space: a Box, or a Dict; images may be channel-last or channel-first, here and in the source
+    :return: (n, *shape) of the space's dtype, or a dict of such; raises ``DatasetError`` where there is none, or where shape,
+        dtype or range do not fit the space
+    """
+    value: Any = source
+    file: str | os.PathLike = ""
+    if isinstance(source, str | os.PathLike):
+        file = path = Path(source).expanduser()
+        if path.is_dir():
+            value = _read_pictures(path, observation_space)
+        elif path.suffix in (".npz", ".npy"):
+            value = _read_numpy(path, observation_space)
+        else:
+            value = _read_hdf5(path)
+    if isinstance(value, Mapping) and isinstance(observation_space, spaces.Dict):
+        plain = observation_space.spaces
+        value = {key: _match_layout(np.asarray(part), plain[key]) if key in plain else part for key, part in value.items()}
+    elif not isinstance(value, Mapping):
+        value = _match_layout(np.asarray(value), observation_space)
+    arrays = check_observations(value, observation_space, None, file, "examples")
+    n = len(next(iter(arrays.values())))
+    for name, array in arrays.items():
+        if len(array) != n:
+            raise DatasetError(file, name, f"holds {len(array)} examples, other keys {n}", "Give equally many for each key")
+        if n == 0:
+            raise DatasetError(file, name, "holds no example", "Give at least one observation of the solved task")
+        if array.dtype == np.uint8 and array.ndim == 4 and array.max() <= 1:
+            remedy = "Multiply them by 255 before casting to uint8"
+            raise DatasetError(file, name, "holds only the pixel values 0 and 1", remedy)
+    if isinstance(observation_space, spaces.Dict):
+        return {name.removeprefix("examples/"): array for name, array in arrays.items()}
+    return arrays["examples"]
+
+
+def save_examples(
+    path: str | os.PathLike,
+    observations: np.ndarray | Mapping[str, np.ndarray],
+    observation_space: spaces.Space,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """
+    Write success examples to an HDF5 file, replacing an older one whole.
+
+    :param path: the file
+    :param observations: (n, *shape), or a dict of such for a Dict space
+    :param observation_space: space of one observation
+    :param provenance: where they come from (JSON)
+    """
+    arrays = check_observations(observations, observation_space, None, path)
+    with replacing(Path(path)) as temporary, h5py.File(temporary, "w", locking=False) as file:
+        file.attrs["format"] = EXAMPLES_FORMAT
+        file.attrs["format_version"] = EXAMPLES_VERSION
+        file.attrs["observation_space"] = space_to_json(observation_space)
+        file.attrs["provenance"] = json.dumps(dict(provenance or {}))
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)
+
+
+def _read_hdf5(path: Path) -> Observations:
+    with open_hdf5(path) as file:
+        if file.attrs.get("format") != EXAMPLES_FORMAT or file.attrs.get("format_version") != EXAMPLES_VERSION:
+            found = f"is {file.attrs.get('format')!r} version {file.attrs.get('format_version')}"
+            remedy = "Extract examples from a dataset first (sb3-offline examples), or give .npz, .npy or a folder of pictures"
+            raise DatasetError(path, "attribute format", f"{found}, expected {EXAMPLES_FORMAT!r} {EXAMPLES_VERSION}", remedy)
+        node = file.get("observations")
+        if node is None:
+            raise DatasetError(path, "observations", "is missing", "Write the file again with save_examples")
+        return node[()] if isinstance(node, h5py.Dataset) else {key: array[()] for key, array in node.items()}
+
+
+def _read_numpy(path: Path, space: spaces.Space) -> Observations:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise DatasetError(path, "file", "does not exist", "Check the path") from error
+    except (OSError, ValueError) as error:  # not NumPy's format, cut off, or pickled objects
+        raise DatasetError(path, "file", f"cannot be read ({error})", "Save plain arrays with numpy.savez") from error
+    if isinstance(loaded, np.ndarray):
+        return loaded
+    arrays = dict(loaded)
+    if isinstance(space, spaces.Dict):
+        return arrays
+    if "observations" not in arrays and len(arrays) != 1:
+        problem = f"holds the arrays {sorted(arrays)}, none of them called 'observations'"
+        raise DatasetError(path, "observations", problem, "Rename the array of examples, or save it alone")
+    return arrays["observations"] if "observations" in arrays else next(iter(arrays.values()))
+
+
+def _read_pictures(folder: Path, space: spaces.Space) -> np.ndarray:
+    """:return: (n, height, width, channels) uint8"""
+    from PIL import Image, ImageOps
+
+    if not (isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3):
+        problem = f"holds pictures, but the observation space is {space}"
+        raise DatasetError(folder, "examples", problem, "Pictures need a space of uint8 images")
+    height, width, channels = _channels_last(space.shape)
+    mode = {1: "L", 3: "RGB"}.get(channels)
+    if mode is None:
+        problem = f"holds single pictures, but an observation has {channels} channels"
+        raise DatasetError(folder, "examples", problem, "Stack the frames yourself and give an array or .npz")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    if not paths:
+        raise DatasetError(folder, "examples", "holds no .png, .jpg or .jpeg", "Put pictures of the solved task there")
+    frames = np.empty((len(paths), height, width, channels), np.uint8)
+    for frame, path in zip(frames, paths, strict=True):
+        try:
+            with Image.open(path) as image:
+                if image.mode not in EIGHT_BIT_MODES:
+                    problem = f"has pixels of Pillow's mode {image.mode}"
+                    raise DatasetError(path, "picture", problem, "Save it with 8 bits a channel")
+                # Photographs hold their rotation in a tag; and averaging filters, or thin things vanish
+                upright = ImageOps.exif_transpose(image).convert(mode)
+                frame[:] = np.asarray(upright.resize((width, height), Image.Resampling.BOX)).reshape(frame.shape)
+        except OSError as error:
+            raise DatasetError(path, "picture", f"cannot be read ({error})", "Save it again, or take it out") from error
+    return frames
+
+
+def _channels_last(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """:return: (height, width, channels) of an image shape in either layout; the smallest axis at an end is the channels"""
+    first, middle, last = shape
+    return (middle, last, first) if first < last else (first, middle, last)
+
+
+def _match_layout(array: np.ndarray, space: spaces.Space) -> np.ndarray:
+    """Turn images channel-first or channel-last where that makes them fit; anything else is left for the check."""
+    shape = tuple(space.shape or ())
+    if array.ndim == 4 and len(shape) == 3 and array.shape[1:] != shape:
+        for axes in ((0, 3, 1, 2), (0, 2, 3, 1)):
+            if array.transpose(axes).shape[1:] == shape:
+                return array.transpose(axes)
+    return array
