@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_offline.envs.multimodal_metaworld.rendering import FRAME_SIZE, SceneRenderer
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS, JITTER, TableScene
 from sb3_offline.envs.multimodal_metaworld.tasks import TASKS, make_tasks
 
@@ -67,11 +68,13 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         self._tasks = make_tasks(self.scene)
         self._task_index = TASKS.index(task)
         self._n_decisions = 0
+        self._solved = False
+        self._renderer: SceneRenderer | None = None
 
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space: spaces.Box
         if obs_type == "pixels":
-            self.observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+            self.observation_space = spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         else:
             # Wide enough for every reachable value, joint limits being soft.
             bound = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
@@ -135,8 +138,34 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         }
         return reward, info
 
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        :return: (height, width, 3) uint8, or None without a render_mode
+        """
+        return None if self.render_mode is None else self.picture(self.width, self.height)
+
+    def picture(self, width: int, height: int) -> np.ndarray:
+        """
+        :param width: in pixels
+        :param height: in pixels
+        :return: (height, width, 3) uint8 of the scene as it is, for people: finer than the observation
+        """
+        return self._get_renderer().picture(width, height)
+
+    def close(self) -> None:
+        """Free the OpenGL context, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _get_renderer(self) -> SceneRenderer:
+        # Made late: neither state observations nor the import of this module may need OpenGL.
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.scene)
+        return self._renderer
+
     def _observation(self) -> np.ndarray:
-        return self._state()
+        return self._get_renderer().frame() if self.obs_type == "pixels" else self._state()
 
     def _state(self) -> np.ndarray:
         data = self.scene.data

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from functools import lru_cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -32,6 +33,13 @@ JITTER = 0.015
 N_ARM_JOINTS = 9
 """Seven arm joints and two fingers come first in qpos and qvel."""
 
+FINE_ARM_GROUP = 2
+"""Geom group of the arm's own meshes: MuJoCo draws groups 0 to 2 unless told otherwise."""
+
+COARSE_ARM_GROUP = 3
+"""Geom group of their coarse twins, for small frames."""
+
+_COARSE_CELL = 0.015  # metres; a pixel of a 64-pixel frame covers about 25 mm
 _SETTLE_STEPS = 500
 
 _DEPENDENCIES = ("puck_goal", "dial", "doorlock", "drawer", "lever", "xyz_base")
@@ -75,6 +83,60 @@ def _scene_xml() -> str:
     </mujoco>"""
 
 
+def _coarsened(path: Path, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """
+    A mesh with the vertices of each cell of a grid merged into their mean.
+
+    :param path: binary STL file
+    :param cell: edge of a cell in the file's units
+    :return: (V, 3) vertices and (F, 3) vertex indices of the faces that keep three corners
+    """
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = np.fromfile(path, dtype=record, offset=84)["corners"].reshape(-1, 3)
+    place = np.floor(corners / cell).astype(np.int64)
+    place -= place.min(axis=0)
+    key = np.ravel_multi_index(tuple(place.T), tuple(place.max(axis=0) + 1))
+    _, cluster, size = np.unique(key, return_inverse=True, return_counts=True)
+    vertices = np.stack([np.bincount(cluster, corners[:, axis]) / size for axis in range(3)], axis=1)
+    faces = cluster.reshape(-1, 3)
+    kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return vertices, faces[kept]
+
+
+def _add_coarse_arm(spec: mujoco.MjSpec) -> None:
+    """Most of a 64-pixel frame's cost is the arm's fine meshes: give each a coarse twin, and a group by which to choose."""
+    meshes = {mesh.name: mesh for mesh in spec.meshes}
+    for geom in list(spec.geoms):
+        mesh = meshes.get(geom.meshname)
+        if mesh is None or "xyz_base" not in Path(mesh.file).parts:
+            continue
+        geom.group = FINE_ARM_GROUP
+        vertices, faces = _coarsened(ENV_ASSET_DIR_V3 / "sawyer_xyz" / mesh.file, _COARSE_CELL)
+        twin = spec.add_mesh(name=f"{mesh.name}_coarse", uservert=vertices.ravel(), userface=faces.ravel())
+        geom.parent.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=twin.name,
+            pos=geom.pos,
+            quat=geom.quat,
+            rgba=geom.rgba,
+            group=COARSE_ARM_GROUP,
+            contype=0,
+            conaffinity=0,
+            mass=0,
+        )
+
+
+def _make_success_visible(spec: mujoco.MjSpec) -> None:
+    """At 64 pixels a dark dial's angle and a puck under its net are lost on a person: colours only, nothing moves."""
+    for geom in spec.geoms:
+        if geom.meshname == "dialhead":
+            geom.material, geom.rgba = "", (0.95, 0.95, 0.9, 1.0)
+        elif geom.meshname == "goal_net":
+            geom.material, geom.rgba = "", (0.85, 0.85, 0.85, 0.12)
+    for material in spec.materials:
+        material.reflectance = 0.0  # each mirror draws the scene once more
+
+
 @lru_cache(maxsize=1)
 def _compiled() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
     """
@@ -88,6 +150,8 @@ def _compiled() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
     for joint in spec.joints:
         if joint.name == "goal_slidey" and joint.parent.name == "drawer_link":
             joint.name = "drawer_slide"
+    _make_success_visible(spec)
+    _add_coarse_arm(spec)
     model = spec.compile()
     # Meta-World's own weld between mocap and hand: relative pose (0, -1 0 0 0), torque scale 5.
     model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD] = [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5]

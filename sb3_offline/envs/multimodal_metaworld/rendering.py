@@ -1,0 +1,141 @@
+"""Drawing the shared table without a screen: small frames to learn from, and pictures for people."""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import os
+import subprocess
+import sys
+import weakref
+from ctypes.util import find_library
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_offline.envs.multimodal_metaworld.scene import COARSE_ARM_GROUP, FINE_ARM_GROUP, TableScene
+
+FRAME_SIZE = 64
+_OVERSAMPLING = 2  # pixels drawn for one kept, in each direction: cheaper in software than multisampling, and as smooth
+
+# All five objects and the hand's whole workspace, from where the arm hides least.
+_CAMERA = {"lookat": (0.08, 0.68, 0.1), "distance": 1.45, "azimuth": 170.0, "elevation": -50.0}
+
+_HELP = """Rendering without a screen needs OpenGL. Install one of these (Debian and Ubuntu packages):
+    apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri
+    apt-get install libosmesa6
+State observations (obs_type="state") without a render_mode need neither."""
+
+
+def _works(backend: str) -> bool:
+    """Try in another process: PyOpenGL and MuJoCo settle on one backend, and cannot go back."""
+    code = f"import mujoco.{backend}; mujoco.{backend}.GLContext(8, 8).make_current()"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def _choose_backend() -> str:
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen in ("egl", "osmesa", "glfw"):
+        return chosen
+    if not sys.platform.startswith("linux"):
+        return "glfw"
+    # EGL may use a GPU; OSMesa needs no driver. Only where both are installed is there something to find out.
+    if find_library("OSMesa") and not (find_library("EGL") and _works("egl")):
+        return "osmesa"
+    return "egl"
+
+
+def _make_gl_context(width: int, height: int) -> Any:
+    """
+    :return: a current OpenGL context of the backend that MUJOCO_GL names, else of the one that works here
+    """
+    backend = _choose_backend()
+    try:
+        context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        context.make_current()
+        return context
+    except Exception as error:  # each library has errors of its own, down to AttributeError for a missing file
+        failure = f"{type(error).__name__}: {error}"
+    # Outside of `except`: the half-made context is gone by now, with its noise, and the help stands last.
+    raise RuntimeError(f"{_HELP}\nTried {backend}: {failure}")
+
+
+_open_renderers: weakref.WeakSet[SceneRenderer] = weakref.WeakSet()
+
+
+def _close_all() -> None:
+    for renderer in list(_open_renderers):
+        renderer.close()
+
+
+class SceneRenderer:
+    """
+    Draws one scene. Owns an OpenGL context; `close` frees it.
+
+    :param scene: what to draw
+    """
+
+    def __init__(self, scene: TableScene) -> None:
+        self._scene = scene
+        self._closed = False
+        size = FRAME_SIZE * _OVERSAMPLING
+        self._gl = _make_gl_context(size, size)
+        visual = scene.model.vis
+        visual.quality.offsamples = 0
+        visual.global_.offwidth = visual.global_.offheight = size
+        self._context = mujoco.MjrContext(scene.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._drawn = mujoco.MjvScene(scene.model, maxgeom=200)
+        self._drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._options = mujoco.MjvOption()
+        # Sites mark goals, and one of them only the last task's.
+        self._options.sitegroup[:] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        for name, value in _CAMERA.items():
+            setattr(self._camera, name, value)
+        _open_renderers.add(self)
+        # Again with each context: it has to run before MuJoCo's own handler, which takes the display away at exit.
+        atexit.unregister(_close_all)
+        atexit.register(_close_all)
+
+    def frame(self) -> np.ndarray:
+        """
+        :return: (64, 64, 3) uint8, what a policy sees
+        """
+        return self._draw(FRAME_SIZE, FRAME_SIZE, fine=False)
+
+    def picture(self, width: int, height: int) -> np.ndarray:
+        """
+        :param width: in pixels
+        :param height: in pixels
+        :return: (height, width, 3) uint8 of the same view, with the arm's fine meshes and shadows
+        """
+        return self._draw(width, height, fine=True)
+
+    def _draw(self, width: int, height: int, *, fine: bool) -> np.ndarray:
+        self._gl.make_current()
+        wide, high = width * _OVERSAMPLING, height * _OVERSAMPLING
+        if wide > self._context.offWidth or high > self._context.offHeight:
+            mujoco.mjr_resizeOffscreen(max(wide, self._context.offWidth), max(high, self._context.offHeight), self._context)
+        self._drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = fine
+        self._options.geomgroup[FINE_ARM_GROUP], self._options.geomgroup[COARSE_ARM_GROUP] = fine, not fine
+        scene, viewport = self._scene, mujoco.MjrRect(0, 0, wide, high)
+        mujoco.mjv_updateScene(
+            scene.model, scene.data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
+        )
+        mujoco.mjr_render(viewport, self._drawn, self._context)
+        pixels = np.empty((high, wide, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(pixels, None, viewport, self._context)
+        blocks = pixels[::-1].reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3)
+        return (blocks.sum(axis=(1, 3), dtype=np.uint16) // _OVERSAMPLING**2).astype(np.uint8)
+
+    def close(self) -> None:
+        """Free the OpenGL context; again does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
