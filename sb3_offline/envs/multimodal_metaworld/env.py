@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -40,7 +40,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     :param height: of the pictures of `render()`
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -142,15 +142,21 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :return: (height, width, 3) uint8, or None without a render_mode
         """
-        return None if self.render_mode is None else self.picture(self.width, self.height)
+        return None if self.render_mode is None else self.get_picture(self.width, self.height)
 
-    def picture(self, width: int, height: int) -> np.ndarray:
+    def get_picture(self, width: int, height: int) -> np.ndarray:
         """
         :param width: in pixels
         :param height: in pixels
         :return: (height, width, 3) uint8 of the scene as it is, for people: finer than the observation
         """
         return self._get_renderer().picture(width, height)
+
+    def get_frame(self) -> np.ndarray:
+        """
+        :return: (64, 64, 3) uint8 of the scene as it is: the observation of obs_type "pixels", whatever this one's is
+        """
+        return self._get_renderer().frame()
 
     def close(self) -> None:
         """Free the OpenGL context, if there is one."""
@@ -165,7 +171,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._renderer
 
     def _observation(self) -> np.ndarray:
-        return self._get_renderer().frame() if self.obs_type == "pixels" else self._state()
+        return self.get_frame() if self.obs_type == "pixels" else self._state()
 
     def _state(self) -> np.ndarray:
         data = self.scene.data
