@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +22,7 @@ from metaworld import policies
 from tqdm.auto import tqdm
 
 import sb3_offline.envs  # noqa: F401  (registers the environment)
+from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
 ENV_ID = "MultimodalMetaworld-v0"
@@ -93,7 +94,7 @@ class _Attempt:
         if manner == "misaimed":
             direction = rng.normal(size=3) * (1.0, 1.0, 0.5)
             self._aim = direction / np.linalg.norm(direction) * rng.uniform(0.05, 0.12)
-        self._end = rng.integers(1, 0.85 * self._script.n_decisions) if manner == "aborted" else None
+        self._end = rng.integers(1, int(0.85 * self._script.n_decisions)) if manner == "aborted" else None
         self._rests_after_success = self._script.lets_go or rng.random() < 0.5
         self._afterwards = rng.choice(["rest", "drift", "leave"])
         self._drift = np.append(rng.uniform(-0.6, 0.6, 3), rng.uniform(-1.0, 1.0))
@@ -126,7 +127,9 @@ def _run_episode(env: gym.Env, task: str, seed: int) -> ScriptedEpisode:
     index = TASKS.index(task)
     attempt = _Attempt(task, np.random.default_rng((seed, index)))
     observation, _ = env.reset(seed=seed)
-    observations, actions, successes, rewards, states = [observation], [], [], [], []
+    observations = [observation]
+    actions: list[np.ndarray] = []
+    successes, rewards, states = [], [], []
     solved = truncated = False
     while not truncated:
         action = attempt.act(len(actions), scene_env.stock_observation(task), solved)
@@ -202,7 +205,7 @@ def collect_scripted(
     seed: int = 0,
     n_workers: int = 2,
     progress: bool = True,
-    mode: str = "x",
+    mode: Literal["x", "w"] = "x",
 ) -> dict[str, float]:
     """
     Collect episodes and write them to one dataset file.
@@ -220,8 +223,6 @@ def collect_scripted(
     :param mode: "x" refuses an existing file, "w" replaces it
     :return: for each task the share of its episodes that succeeded at some step
     """
-    from sb3_offline.data.writer import DatasetWriter
-
     env = _shared_env(obs_type)
     n_episodes = episodes_per_task * len(tasks)
     n_steps = n_episodes * env.unwrapped.episode_length  # type: ignore[attr-defined]
