@@ -190,10 +190,11 @@ def format_summary(summary: dict[str, Any]) -> str:
     :return: a text for the terminal
     """
     lines = [f"{summary['file']}  ({summary['bytes'] / 1e6:,.1f} MB, {summary['storage']})"]
-    lines += [f"  environment   {summary['env_id'] or '-'} {summary['env_kwargs'] or ''}".rstrip()]
-    lines += [f"  observations  {summary['observation_space']}", f"  actions       {summary['action_space']}"]
-    lines += [f"  extras        {name}: {shape} {dtype}" for name, (shape, dtype) in summary["extras"].items()]
-    lines += [f"  {key:<13} {value}" for key, value in summary["provenance"].items()]
+    about = {"environment": f"{summary['env_id'] or '-'} {summary['env_kwargs'] or ''}".rstrip()}
+    about |= {"observations": summary["observation_space"], "actions": summary["action_space"]}
+    about |= {f"extras/{name}": f"{shape} {dtype}" for name, (shape, dtype) in summary["extras"].items()}
+    about |= summary["provenance"]
+    lines += [f"  {key:<{max(map(len, about))}}  {value}" for key, value in about.items()]
     counts = f"  {summary['n_episodes']:,} episodes, {summary['n_steps']:,} steps"
     if "lengths" in summary:
         lengths = summary["lengths"]

@@ -178,6 +178,7 @@ def _create_array(file: h5py.File, name: str, shape: tuple[int, ...], spec: Fiel
     plist.set_layout(h5py.h5d.CONTIGUOUS)
     plist.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     plist.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    plist.set_obj_track_times(False)  # the same data give the same file, byte for byte
     group, _, leaf = name.rpartition("/")
     parent = file.require_group(group) if group else file
     h5py.h5d.create(

@@ -4,7 +4,7 @@ import glob
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -130,21 +130,25 @@ class OfflineDataset:
             raise DatasetError(self.path, "episodes/length", problem, "Leave empty episodes out")
         n_steps = int(lengths.sum())
         arrays = {}
-        for name, spec in fields.items():
-            array, rows = file[name], spec.rows(n_episodes, n_steps)
-            if array.dtype != spec.dtype or array.shape[1:] != spec.shape:
-                problem = f"holds rows of shape {array.shape[1:]} and dtype {array.dtype}, expected {spec.shape} {spec.dtype}"
-                raise DatasetError(self.path, name, problem, "Write the file again with DatasetWriter")
-            if len(array) < rows:
-                problem = f"has {len(array)} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
-                raise DatasetError(self.path, name, problem, "Leave out incomplete episodes, or write the file again")
-            arrays[name] = self._read_array(array, name, spec, rows)
+        # Map the very file that is open: a writer may put a larger one in its place meanwhile
+        with os.fdopen(os.dup(file.id.get_vfd_handle()), "rb") as raw:
+            for name, spec in fields.items():
+                array, rows = file[name], spec.rows(n_episodes, n_steps)
+                if array.dtype != spec.dtype or array.shape[1:] != spec.shape:
+                    problem = (
+                        f"holds rows of shape {array.shape[1:]} and dtype {array.dtype}, expected {spec.shape} {spec.dtype}"
+                    )
+                    raise DatasetError(self.path, name, problem, "Write the file again with DatasetWriter")
+                if len(array) < rows:
+                    problem = f"has {len(array)} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
+                    raise DatasetError(self.path, name, problem, "Leave out incomplete episodes, or write the file again")
+                arrays[name] = self._read_array(array, raw, name, spec, rows)
         return n_episodes, arrays
 
-    def _read_array(self, array: h5py.Dataset, name: str, spec: Field, rows: int) -> ArrayLike:
+    def _read_array(self, array: h5py.Dataset, raw: BinaryIO, name: str, spec: Field, rows: int) -> ArrayLike:
         offset = array.id.get_offset()
         if offset is not None and rows * spec.row_bytes > 0:
-            mapped = np.memmap(self.path, spec.dtype, "r", offset, (rows, *spec.shape))
+            mapped = np.memmap(raw, spec.dtype, "r", offset, (rows, *spec.shape))
             return mapped.view(np.ndarray)  # a plain array over the map: np.memmap itself makes every indexing slower
         if name.startswith(("observations", "extras/")) and rows:
             return HDF5Array(self.path, name, rows, spec)

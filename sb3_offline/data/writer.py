@@ -34,7 +34,7 @@ class DatasetWriter:
     :param env_kwargs: its keyword arguments (JSON)
     :param provenance: where the data come from: program, command, seed, versions, policy, ... (JSON). When appending, a
         provenance other than the file's is added to the list ``provenance["appended"]``
-    :param mode: "x": the file must not exist; "w": replace it; "a": append to it, or create it
+    :param mode: "x": the file must not exist; "w": replace it; "a": append to it (which copies it once), or create it
     :param rewards: whether episodes have rewards
     :param success: whether episodes have success labels
     :param extras: further per-step arrays: name to (shape of one row, dtype)
@@ -59,6 +59,8 @@ class DatasetWriter:
         capacity: tuple[int, int] = (1024, 65536),
     ):
         self.path = Path(os.path.realpath(path))
+        if mode not in ("x", "w", "a"):  # or a mistyped mode would replace the file
+            raise DatasetError(self.path, "mode", f"is {mode!r}", "Give 'x', 'w' or 'a'")
         self.n_episodes = 0
         self.n_steps = 0
         self._file: Any = None
