@@ -25,27 +25,34 @@ def transitions_by_slow_loop(episodes, n_steps, next_actions):
     for episode in episodes:
         obs, done, reward = episode["observations"], episode["terminated"], episode["rewards"]
         action = (episode["actions"] - ACTIONS.low) / (ACTIONS.high - ACTIONS.low) * 2 - 1
-        for t in range(len(action) - 1 if next_actions else len(action)):
+        last = len(action) - 1
+        for t in range(len(action)):
+            # With next actions a window ends at the last step, which is its own successor.
+            own_successor = next_actions and t == last
             end = t
             reward_sum, discount = 0.0, 1.0
-            while end - t < n_steps and end < (len(action) - 1 if next_actions else len(action)):
+            while end - t < n_steps and end < (last if next_actions and not own_successor else last + 1):
                 reward_sum += discount * reward[end]
                 discount *= GAMMA
                 end += 1
+            done_at = end - 1
+            if own_successor:
+                end = t
+            one = t if own_successor else t + 1
             rows.append(
                 {
                     "observations": obs[t],
                     "actions": action[t],
-                    "next_observations": obs[t + 1],
+                    "next_observations": obs[one],
                     "dones": [done[t]],
                     "rewards": [reward[t]],
                     "discounts": [GAMMA],
-                    "next_actions": action[t + 1] if next_actions else None,
+                    "next_actions": action[one] if next_actions else None,
                     "nstep_observations": obs[end],
                     "nstep_actions": action[end] if next_actions else None,
                     "nstep_discounts": [discount],
                     "nstep_rewards": [reward_sum],
-                    "nstep_dones": [done[end - 1]],
+                    "nstep_dones": [done[done_at]],
                 }
             )
     return rows
@@ -61,7 +68,7 @@ def test_samples_are_those_of_a_slow_loop(tmp_path, n_steps, next_actions, stora
     buffer = OfflineReplayBuffer(str(tmp_path / "*.h5"), STATES, ACTIONS, "cpu", **options)
     expected = transitions_by_slow_loop(episodes, n_steps, next_actions)
     assert buffer.size() == len(expected)
-    samples = buffer._get_samples(buffer._valid)
+    samples = buffer._get_samples(np.arange(buffer.size()))
     for name, values in samples._asdict().items():
         if values is None:
             assert (n_steps == 1 and name.startswith("nstep")) or (not next_actions and name.endswith("_actions"))
@@ -71,10 +78,10 @@ def test_samples_are_those_of_a_slow_loop(tmp_path, n_steps, next_actions, stora
         np.testing.assert_allclose(values.numpy(), wanted, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_every_valid_step_is_drawn_equally_often(tmp_path):
+def test_every_step_is_drawn_equally_often(tmp_path):
     write_dataset(tmp_path / "a.h5", 6, STATES)
     buffer = OfflineReplayBuffer(tmp_path / "a.h5", STATES, ACTIONS, "cpu", next_actions=True, seed=0)
-    all_steps = buffer._get_samples(buffer._valid).observations.numpy()
+    all_steps = buffer._get_samples(np.arange(buffer.size())).observations.numpy()
     drawn = buffer.sample(20_000).observations.numpy()
     counts = (drawn[:, None, 0] == all_steps[None, :, 0]).sum(axis=0)
     expected = 20_000 / buffer.size()

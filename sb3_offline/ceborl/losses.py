@@ -10,6 +10,9 @@ import math
 import torch as th
 from torch.nn import functional as F
 
+#: Odds beyond this are out of any use; the bound keeps float32 finite.
+OVERFLOW = 1e8
+
 
 def _full_precision(logits: th.Tensor) -> th.Tensor:
     """bfloat16 has three digits: far too few for a softplus of a saturated logit."""
@@ -70,3 +73,33 @@ def recursive_loss(data_logits: th.Tensor, discounted_omega: th.Tensor) -> th.Te
     """
     logits = _full_precision(data_logits)
     return (discounted_omega * F.softplus(-logits) + F.softplus(logits)).mean(dim=1).sum()
+
+
+def advantage_weights(
+    data_logits: th.Tensor,
+    state_logits: th.Tensor,
+    example_logits: th.Tensor,
+    temperature: float,
+    advantage_floor: float,
+    weight_max: float,
+) -> th.Tensor:
+    """
+    How much more the data's action promises than the data's actions do on average in its state:
+    ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature)``.
+
+    A ratio, since odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share of the examples'
+    odds: where both odds are far under it, their ratio is noise, and the weight is about 1.
+
+    :param data_logits: logits of dataset actions, ``(n_critics, batch)``
+    :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
+    :param example_logits: logits of success examples, ``(n_critics, batch)``; the scale of the odds
+    :param temperature: the smaller, the sharper
+    :param advantage_floor: eps as a share of the examples' mean odds
+    :param weight_max: upper bound
+    :return: ``(batch,)``
+    """
+    odds = success_odds(data_logits, OVERFLOW)
+    state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
+    eps = advantage_floor * success_odds(example_logits, OVERFLOW).mean()
+    log_ratio = th.log(odds + eps) - th.log(state_odds + eps)
+    return (log_ratio / temperature).clamp(max=math.log(weight_max)).exp()

@@ -33,9 +33,7 @@ def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) ->
     return shifted
 
 
-def shift_observations(
-    observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator
-) -> PyTorchObs:
+def shift_observations(observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator) -> PyTorchObs:
     """
     Apply :func:`random_shift` to every image in a batch of observations; vectors pass unchanged.
 

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from os import PathLike
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -17,10 +16,10 @@ from stable_baselines3.common.utils import polyak_update
 
 from sb3_offline.common.augmentation import shift_observations
 from sb3_offline.common.stub_env import SpacesOnlyEnv
-from sb3_offline.data import OfflineDataset, OfflineReplayBuffer
+from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
-DatasetSource = str | PathLike | list[str | PathLike] | OfflineDataset
 
 
 class OfflineAlgorithm(OffPolicyAlgorithm):
@@ -54,6 +53,10 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
     #: whether ``train()`` needs the dataset's action at the next step (and so leaves out each episode's last step)
     needs_next_actions: bool = False
+    _replay_buffer: Any
+    # Of the actor-critic algorithms:
+    critic: th.nn.Module
+    critic_target: th.nn.Module
 
     def __init__(
         self,
@@ -67,7 +70,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         n_steps: int = 1,
         target_update_interval: int = 1,
         random_shift: int = 4,
-        dataset_storage: str = "auto",
+        dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -76,7 +79,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         seed: int | None = None,
     ):
         if env is None and dataset is not None:
-            opened = dataset if isinstance(dataset, OfflineDataset) else OfflineDataset(_first_path(dataset))
+            opened = open_datasets(dataset)[0]
             env = SpacesOnlyEnv(opened.observation_space, opened.action_space)
         super().__init__(
             policy,
@@ -142,25 +145,24 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
                 seed=self.seed,
             )
             if self._sampler_state is not None:
-                self._replay_buffer.rng.bit_generator.state = self._sampler_state
-            self._fit_vec_normalize()
+                self._replay_buffer.set_rng_state(self._sampler_state)
+            self._fit_observation_statistics()
         return self._replay_buffer
 
     @replay_buffer.setter
     def replay_buffer(self, buffer: ReplayBuffer | None) -> None:
-        self._replay_buffer: Any = buffer
+        self._replay_buffer = buffer
 
-    def _fit_vec_normalize(self) -> None:
-        """Without a rollout, the running statistics of a ``VecNormalize`` have to come from the dataset."""
+    def _fit_observation_statistics(self) -> None:
         normalize = self._vec_normalize_env
-        if normalize is None or not normalize.training or not normalize.norm_obs:
-            return
-        statistics = self._replay_buffer.observation_statistics()
-        if isinstance(normalize.obs_rms, dict):
-            for key, rms in normalize.obs_rms.items():
-                rms.mean, rms.var, rms.count = statistics[key]
-        else:
-            normalize.obs_rms.mean, normalize.obs_rms.var, normalize.obs_rms.count = statistics
+        if normalize is None or not normalize.norm_obs:
+            self.policy.fit_observation_statistics(self._replay_buffer.observation_statistics)  # type: ignore[operator]
+        elif normalize.training:
+            # Without a rollout, the running statistics of a VecNormalize have to come from the dataset.
+            statistics = self._replay_buffer.observation_statistics()
+            running = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
+            for key, rms in running.items():
+                rms.mean, rms.var, rms.count = statistics[key] if key else statistics
 
     def augment(self, observations: PyTorchObs) -> PyTorchObs:
         """
@@ -241,9 +243,15 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def _on_step(self) -> None:
         """Called after each gradient step, before the callbacks."""
 
+    @staticmethod
+    def _optimize(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
     def _update_target(self) -> None:
         if self._n_updates % self.target_update_interval == 0:
-            polyak_update(self.policy.critic.parameters(), self.policy.critic_target.parameters(), self.tau)
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
 
     # --------------------------------------------------------------- logging
 
@@ -270,7 +278,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         if self._replay_buffer is not None:
-            self._sampler_state = self._replay_buffer.rng.bit_generator.state
+            self._sampler_state = self._replay_buffer.get_rng_state()
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
@@ -288,7 +296,3 @@ class _GradientStepBar(ProgressBarCallback):
     def _on_step(self) -> bool:
         self.pbar.update(1)
         return True
-
-
-def _first_path(dataset: Any) -> Any:
-    return dataset[0] if isinstance(dataset, (list, tuple)) else dataset

@@ -1,25 +1,28 @@
 """
 Actor-critic policies of the offline algorithms.
 
-They are SB3's SAC policies with three differences that offline learning from pixels needs: the encoder is trained by the
-critic (SB3 lets the *actor* train a shared one), it is run once per image however many actions are then scored, and the
-actor's standard deviation can be kept above a floor.
+They are SB3's SAC policies with the differences that offline learning needs: vectors are standardised by the dataset's
+statistics; the encoder is trained by the critic (SB3 lets the *actor* train a shared one) and run once per image however
+many actions are then scored; the actor scores given actions, with a floor under its standard deviation; and the critic may
+have a head for the value of a state without an action.
 """
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_offline.common.torch_layers import NormalizedNatureCNN
+from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
 # Actions of a dataset often sit exactly on the bounds, where atanh is infinite.
 ACTION_LIMIT = 0.999
@@ -91,6 +94,22 @@ class OfflineActor(Actor):
         distribution = self._squashed_gaussian().proba_distribution(mean, log_std)
         return distribution.log_prob(actions.clamp(-ACTION_LIMIT, ACTION_LIMIT))
 
+    def regression_loss(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Squared error of the mode, and the negative log-likelihood of the standard deviation around that mode.
+
+        Steadier than the likelihood of both together: an action on the bounds lies far out before the tanh, where a few such
+        actions move the mean of a Gaussian more than all the others.
+
+        :param features: ``(batch, features_dim)``
+        :param actions: ``(batch, action_dim)`` in [-1, 1]
+        :return: loss of each action, ``(batch,)``
+        """
+        mean, log_std = self.gaussian_parameters(features)
+        error = (th.tanh(mean) - actions).pow(2).sum(dim=1)
+        distribution = self._squashed_gaussian().proba_distribution(mean.detach(), log_std)
+        return error - distribution.log_prob(actions.clamp(-ACTION_LIMIT, ACTION_LIMIT))
+
     def _squashed_gaussian(self) -> SquashedDiagGaussianDistribution:
         assert isinstance(self.action_dist, SquashedDiagGaussianDistribution)
         return self.action_dist
@@ -101,6 +120,8 @@ class OfflineCritic(ContinuousCritic):
     Critic networks on one encoder, which their loss trains.
 
     :param layer_norm: put a LayerNorm after each hidden linear layer of the heads
+    :param output_bias: what the heads put out at first, for all states and actions
+    :param state_value: whether to add a head that sees the state without an action
     :param kwargs: see :class:`stable_baselines3.common.policies.ContinuousCritic`
     """
 
@@ -116,6 +137,8 @@ class OfflineCritic(ContinuousCritic):
         n_critics: int = 2,
         share_features_extractor: bool = True,
         layer_norm: bool = False,
+        output_bias: float = 0.0,
+        state_value: bool = False,
     ):
         super().__init__(
             observation_space,
@@ -128,13 +151,15 @@ class OfflineCritic(ContinuousCritic):
             n_critics,
             share_features_extractor,
         )
-        if layer_norm:
-            self.q_networks = []
-            for idx in range(n_critics):
-                input_dim = features_dim + get_action_dim(action_space)
-                layers = create_mlp(input_dim, 1, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm])
-                self.add_module(f"qf{idx}", nn.Sequential(*layers))
-                self.q_networks.append(self.get_submodule(f"qf{idx}"))
+        modules: list[type[nn.Module]] = [nn.LayerNorm] if layer_norm else []
+        input_dims = {f"qf{idx}": features_dim + get_action_dim(action_space) for idx in range(n_critics)}
+        if state_value:
+            input_dims["vf"] = features_dim
+        for name, input_dim in input_dims.items():
+            layers = create_mlp(input_dim, 1, net_arch, activation_fn, post_linear_modules=modules)
+            nn.init.constant_(layers[-1].bias, output_bias)  # type: ignore[arg-type]
+            self.add_module(name, nn.Sequential(*layers))
+        self.q_networks = [self.get_submodule(f"qf{idx}") for idx in range(n_critics)]
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -157,7 +182,7 @@ class OfflineCritic(ContinuousCritic):
         many = actions.dim() == 3
         outputs = []
         for q_net in self.q_networks:
-            assert isinstance(q_net, nn.Sequential)
+            assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             first = q_net[0]
             if many:
                 state_weight, action_weight = first.weight.split([features.shape[1], actions.shape[-1]], dim=1)
@@ -166,6 +191,13 @@ class OfflineCritic(ContinuousCritic):
             else:
                 outputs.append(q_net(th.cat([features, actions], dim=1)).squeeze(1))
         return th.stack(outputs)
+
+    def state_values(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: ``(batch, features_dim)``
+        :return: output of the state head, ``(batch,)``
+        """
+        return self.get_submodule("vf")(features).squeeze(1)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
@@ -182,6 +214,9 @@ class OfflinePolicy(SACPolicy):
     :param share_features_extractor: whether actor and critic share one encoder, trained by the critic alone
     :param std_min: floor of the actor's standard deviation before the tanh
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
+    :param critic_output_bias: what the critics put out at first, everywhere
+    :param critic_state_value: add a critic of states alone
+    :param features_extractor_class: encoder of the observations
     :param kwargs: all other arguments of :class:`stable_baselines3.sac.policies.SACPolicy`: ``net_arch``, ``activation_fn``,
         ``features_extractor_class``, ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
     """
@@ -198,12 +233,24 @@ class OfflinePolicy(SACPolicy):
         share_features_extractor: bool = True,
         std_min: float = 0.0,
         critic_layer_norm: bool = False,
+        critic_output_bias: float = 0.0,
+        critic_state_value: bool = False,
+        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedExtractor,
         **kwargs: Any,
     ):
         self.std_min = std_min
-        self.critic_layer_norm = critic_layer_norm
+        self.offline_critic_kwargs: dict[str, Any] = {
+            "layer_norm": critic_layer_norm,
+            "output_bias": critic_output_bias,
+            "state_value": critic_state_value,
+        }
         super().__init__(
-            observation_space, action_space, lr_schedule, share_features_extractor=share_features_extractor, **kwargs
+            observation_space,
+            action_space,
+            lr_schedule,
+            share_features_extractor=share_features_extractor,
+            features_extractor_class=features_extractor_class,
+            **kwargs,
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -231,16 +278,34 @@ class OfflinePolicy(SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineCritic:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return OfflineCritic(**critic_kwargs, layer_norm=self.critic_layer_norm).to(self.device)
+        return OfflineCritic(**critic_kwargs, **self.offline_critic_kwargs).to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(
             share_features_extractor=self.share_features_extractor,
             std_min=self.std_min,
-            critic_layer_norm=self.critic_layer_norm,
+            **{f"critic_{name}": value for name, value in self.offline_critic_kwargs.items()},
         )
         return data
+
+    def fit_observation_statistics(self, statistics: Callable[[], Any]) -> None:
+        """
+        Fit every :class:`~sb3_offline.common.torch_layers.StandardizedExtractor` that is not fitted yet.
+
+        :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for dict
+            observations; called only where a policy standardises
+        """
+        encoders = {module: "" for module in self.modules() if isinstance(module, StandardizedExtractor)}
+        for module in self.modules():
+            if isinstance(module, StandardizedCombinedExtractor):
+                encoders.update({part: key for key, part in module.extractors.items() if part in encoders})
+        unfitted = {encoder: key for encoder, key in encoders.items() if not encoder.fitted}
+        if unfitted:
+            moments = statistics()
+            for encoder, key in unfitted.items():
+                mean, variance, _ = moments[key] if key else moments
+                encoder.fit(np.asarray(mean), np.asarray(variance))
 
 
 MlpPolicy = OfflinePolicy
@@ -255,11 +320,15 @@ class CnnPolicy(OfflinePolicy):
 
     def __init__(
         self,
-        *args: Any,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
         features_extractor_class: type[BaseFeaturesExtractor] = NormalizedNatureCNN,
         **kwargs: Any,
     ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
 
 
 class MultiInputPolicy(OfflinePolicy):
@@ -271,8 +340,12 @@ class MultiInputPolicy(OfflinePolicy):
 
     def __init__(
         self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedCombinedExtractor,
         **kwargs: Any,
     ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )

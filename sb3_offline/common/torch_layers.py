@@ -1,9 +1,48 @@
-"""Encoders for images."""
+"""Encoders of observations."""
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from torch import nn
+
+
+class StandardizedExtractor(FlattenExtractor):
+    """
+    Flattens vectors and gives each entry the mean 0 and the standard deviation 1 that it has in the dataset.
+
+    The statistics are fitted once, by :meth:`fit`, and saved with the policy. Before that, observations pass unchanged.
+
+    Entries that hardly move in the dataset are amplified by no more than ``1 / std_min``. Such entries are often constant
+    within an episode, and would let a classifier recognise episodes instead of success.
+
+    :param observation_space: vectors
+    :param std_min: floor of the standard deviation
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+    fitted: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space, std_min: float = 0.05):
+        super().__init__(observation_space)
+        self.std_min = std_min
+        self.register_buffer("mean", th.zeros(self.features_dim))
+        self.register_buffer("std", th.ones(self.features_dim))
+        self.register_buffer("fitted", th.tensor(False))
+
+    def fit(self, mean: np.ndarray, variance: np.ndarray) -> None:
+        """
+        :param mean: of the observations, of their shape
+        :param variance: of the observations, of their shape
+        """
+        self.mean.copy_(th.as_tensor(mean, dtype=th.float32).flatten())
+        self.std.copy_(th.as_tensor(np.sqrt(variance), dtype=th.float32).flatten().clamp(min=self.std_min))
+        self.fitted.fill_(True)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return (super().forward(observations) - self.mean) / self.std
 
 
 class NormalizedNatureCNN(NatureCNN):
@@ -24,3 +63,26 @@ class NormalizedNatureCNN(NatureCNN):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return self.linear(self.cnn(observations))
+
+
+class StandardizedCombinedExtractor(CombinedExtractor):
+    """
+    SB3's :class:`~stable_baselines3.common.torch_layers.CombinedExtractor` with the encoders of this module: images go
+    through :class:`NormalizedNatureCNN`, vectors through :class:`StandardizedExtractor`.
+
+    :param observation_space: dict of images (channel-first) and vectors
+    :param cnn_output_dim: number of features of each image
+    :param normalized_image: see :class:`~stable_baselines3.common.torch_layers.NatureCNN`
+    """
+
+    def __init__(self, observation_space: spaces.Dict, cnn_output_dim: int = 256, normalized_image: bool = False):
+        super().__init__(observation_space, cnn_output_dim, normalized_image)
+        for key, space in observation_space.spaces.items():
+            encoder: BaseFeaturesExtractor
+            if is_image_space(space, normalized_image=normalized_image):
+                encoder = NormalizedNatureCNN(space, cnn_output_dim, normalized_image)  # type: ignore[arg-type]
+            elif isinstance(space, spaces.Box):
+                encoder = StandardizedExtractor(space)
+            else:
+                continue  # one-hot vectors stay as they are
+            self.extractors[key] = encoder

@@ -67,8 +67,9 @@ class OfflineReplayBuffer(ReplayBuffer):
     :param gamma: discount of one step
     :param storage: "memory", "mmap" (contiguous files only), or "auto": the latter where the observations would take more than
         half of the available memory
-    :param next_actions: give the dataset's next actions too. Then the last step of an episode, which has none, is not
-        sampled, and windows end one step earlier
+    :param next_actions: give the dataset's next actions too. The last step of an episode has none: windows end at it, and it
+        is its own successor. So every pair of observation and action that a learner bootstraps from is also one that it
+        trains on; leaving the last steps out would make them values that nothing holds down
     :param seed: seed of the generator
     """
 
@@ -116,12 +117,12 @@ class OfflineReplayBuffer(ReplayBuffer):
         n, starts = int(lengths.sum()), np.cumsum(lengths) - lengths
         step = np.arange(n)
         self._observation_rows = step + np.repeat(np.arange(len(lengths)), lengths)
+        # Steps from each to the last one that a window may reach: 0 only where next actions end with the episode
         self._steps_left = np.repeat(starts + lengths, lengths) - step - int(self.next_actions)
-        self._valid = np.flatnonzero(self._steps_left) if self.next_actions else step
-        if len(self._valid) == 0:
-            problem = "holds no episode of two steps or more" if n else "holds no episode"
-            raise DatasetError(self.datasets[0].path, "episodes/length", problem, "Collect or convert the data again")
-        self.buffer_size = len(self._valid)
+        if n == 0:
+            raise DatasetError(
+                self.datasets[0].path, "episodes/length", "holds no episode", "Collect or convert the data again"
+            )
 
     def _scaled_actions(self) -> np.ndarray:
         """As SB3's buffers hold them: [-1, 1] of the space for a Box, integers otherwise."""
@@ -159,7 +160,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         :param env: normalises observations and rewards
         :return: steps drawn uniformly, with replacement
         """
-        return self._get_samples(self._valid[self.rng.integers(0, self.buffer_size, batch_size)], env)
+        return self._get_samples(self.rng.integers(0, self.buffer_size, batch_size), env)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
         """
@@ -168,32 +169,34 @@ class OfflineReplayBuffer(ReplayBuffer):
         :return: these transitions
         """
         rows = self._observation_rows[batch_inds]
+        one = np.minimum(1, self._steps_left[batch_inds])
         samples = OfflineSamples(
             observations=self._observations(rows, env),
             actions=self._to_device(self.actions.take(batch_inds, axis=0)),
-            next_observations=self._observations(rows + 1, env),
+            next_observations=self._observations(rows + one, env),
             dones=self._column(self.dones[batch_inds]),
             rewards=self._column(self._normalize_reward(self.rewards[batch_inds], env)),
             discounts=self._column(np.full(len(batch_inds), self.gamma)),
         )
         if self.next_actions:
-            samples = samples._replace(next_actions=self._to_device(self.actions.take(batch_inds + 1, axis=0)))
+            samples = samples._replace(next_actions=self._to_device(self.actions.take(batch_inds + one, axis=0)))
         return samples._replace(**self._windows(batch_inds, rows, env)) if self.n_steps > 1 else samples
 
     def _windows(self, steps: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        n = np.minimum(self.n_steps, self._steps_left[steps])
+        ahead = np.minimum(self.n_steps, self._steps_left[steps])
+        n = np.maximum(ahead, 1)
         offsets = np.arange(self.n_steps)
         inside = offsets < n[:, None]
         window = steps[:, None] + np.where(inside, offsets, 0)  # outside: any valid row, since its reward is masked
         rewards = self._normalize_reward(self.rewards[window], env) * inside * self.gamma**offsets
         fields = {
-            "nstep_observations": self._observations(rows + n, env),
+            "nstep_observations": self._observations(rows + ahead, env),
             "nstep_discounts": self._column(self.gamma**n),
             "nstep_rewards": self._column(rewards.sum(axis=1)),
             "nstep_dones": self._column(self.dones[steps + n - 1]),
         }
         if self.next_actions:
-            fields["nstep_actions"] = self._to_device(self.actions.take(steps + n, axis=0))
+            fields["nstep_actions"] = self._to_device(self.actions.take(steps + ahead, axis=0))
         return fields
 
     def _observations(self, rows: np.ndarray, env: VecNormalize | None) -> Observations:

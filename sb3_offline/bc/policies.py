@@ -1,0 +1,87 @@
+"""Actor-only policies: the offline policies without a critic, so that the actor trains its own encoder."""
+
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_offline.common.policies import OfflinePolicy
+from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor
+
+
+class BCPolicy(OfflinePolicy):
+    """
+    Policy class of behavioral cloning.
+
+    :param kwargs: see :class:`~sb3_offline.common.policies.OfflinePolicy`; what concerns critics has no effect
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        share_features_extractor: bool = False,
+        std_min: float = 0.05,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            share_features_extractor=share_features_extractor,
+            std_min=std_min,
+            **kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.actor = self.make_actor()
+        self.actor.optimizer = self._make_optimizer(list(self.actor.parameters()), lr_schedule)
+
+    def set_training_mode(self, mode: bool) -> None:
+        self.actor.set_training_mode(mode)
+        self.training = mode
+
+
+MlpPolicy = BCPolicy
+
+
+class CnnPolicy(BCPolicy):
+    """
+    :class:`BCPolicy` for images.
+
+    :param kwargs: see :class:`BCPolicy`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = NormalizedNatureCNN,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
+
+
+class MultiInputPolicy(BCPolicy):
+    """
+    :class:`BCPolicy` for dict observations.
+
+    :param kwargs: see :class:`BCPolicy`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedCombinedExtractor,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )

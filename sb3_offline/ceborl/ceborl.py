@@ -1,0 +1,327 @@
+"""CEBORL: Conservative Example-Based Offline RL."""
+
+import math
+from typing import Any, ClassVar, Literal, TypeVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+
+from sb3_offline.ceborl.losses import (
+    advantage_weights,
+    conservative_penalty,
+    example_loss,
+    recursive_loss,
+    success_odds,
+)
+from sb3_offline.ceborl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.policies import OfflineActor, OfflineCritic, OfflinePolicy
+from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.reader import DatasetSource
+
+SelfCEBORL = TypeVar("SelfCEBORL", bound="CEBORL")
+
+#: The paper's Eq. 10 and 11 to the letter, as constructor arguments.
+PAPER_FORM: dict[str, Any] = {
+    "backup": "policy",
+    "policy_extraction": "maximize",
+    "n_steps": 1,
+    "beta": 0.1,
+    "tau": 0.005,
+    "initial_odds": 1.0,
+}
+
+_CHOICES = {
+    "mu": ("uniform", "policy", "mixture"),
+    "penalty_space": ("probability", "logit"),
+    "backup": ("dataset", "policy"),
+    "policy_extraction": ("weighted", "maximize"),
+}
+
+#: Diagnostics that need extra forward passes are taken once in so many gradient steps.
+DIAGNOSTICS_INTERVAL = 50
+
+
+class CEBORL(ExampleBasedAlgorithm):
+    """
+    Conservative Example-Based Offline RL (CEBORL): learns a task from an unlabelled dataset and examples of success.
+
+    A classifier C(s, a) of success in the discounted future is trained by recursive classification; its odds C / (1 - C) are
+    the Q-value (Eq. 1), and a conservative penalty holds down unseen actions (Eq. 10)::
+
+        min  beta (E_{s ~ D, a ~ mu}[C(s, a)] - E_{s, a ~ D}[C(s, a)])                           (a)
+             + (1 - gamma) E_{s ~ S*, a ~ pi}[CE(C(s, a); y = 1)]                                (b)
+             + E_D[(1 + gamma omega) CE(C(s, a); y = gamma omega / (1 + gamma omega))]           (c)
+
+    with ``omega = C(s', a') / (1 - C(s', a'))`` (Eq. 3). The defaults are not the paper's exact form, which did not learn in
+    our trials (see the docs), but its working relative: ``a'`` is the dataset's next action instead of the policy's, over
+    ``n_steps``, and the policy is fitted to the dataset's actions, weighted by their advantage, instead of maximising C. The
+    paper's form is :data:`PAPER_FORM`: ``CEBORL("CnnPolicy", env, ..., **PAPER_FORM)``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment the policy is meant for, a registered id, or ``None`` (spaces from the dataset)
+    :param dataset: Path(s) of HDF5 datasets, or a glob pattern; rewards and success labels in them are not looked at
+    :param examples: Success examples S*: a folder of pictures, an ``.npz`` or HDF5 file, or an array of observations
+    :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
+    :param batch_size: Transitions in a batch
+    :param example_batch_size: Success examples in a batch
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor
+    :param n_steps: omega is the mean of the 1-step and the n-step odds, discounted (1: the 1-step odds alone)
+    :param beta: weight of the conservative penalty (a)
+    :param n_action_samples: K, actions drawn from mu at each state
+    :param mu: distribution of the penalised actions: ``"uniform"``, ``"policy"``, or ``"mixture"`` (half of each)
+    :param penalty_space: penalise the ``"probability"`` C or the ``"logit"``
+    :param omega_max: bound of omega against overflow; values of 20 to 60 are normal, so keep it far above
+    :param class_prior: weight of the examples in (b), p(e = 1); the paper drops it (1.0)
+    :param initial_odds: odds of the untrained classifier. A network's usual first output, 0, means odds of 1, far above the
+        truth; discounting takes thousands of steps to bring them down, and until then they look like success.
+    :param backup: next action a' of omega: the ``"dataset"``'s, or the ``"policy"``'s as in the paper
+    :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
+        paper's Eq. 11
+    :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
+    :param advantage_floor: odds, as a share of the examples' odds, under which advantages are noise and count little
+    :param weight_max: bound of the advantage weights
+    :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
+    :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
+    :param random_shift: images are shifted by up to so many pixels
+    :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
+    :param stats_window_size: kept for SB3's signature
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: OfflinePolicy
+    actor: OfflineActor
+    critic: OfflineCritic
+    critic_target: OfflineCritic
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        batch_size: int = 256,
+        example_batch_size: int = 256,
+        tau: float = 0.02,
+        gamma: float = 0.99,
+        n_steps: int = 10,
+        beta: float = 0.1,
+        n_action_samples: int = 16,
+        mu: str = "uniform",
+        penalty_space: str = "probability",
+        omega_max: float = 1e4,
+        class_prior: float = 1.0,
+        initial_odds: float = 0.01,
+        backup: str = "dataset",
+        policy_extraction: str = "weighted",
+        temperature: float = 0.3,
+        advantage_floor: float = 0.01,
+        weight_max: float = 100.0,
+        ent_coef: float = 1e-4,
+        target_update_interval: int = 1,
+        random_shift: int = 4,
+        dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            dataset,
+            examples,
+            example_batch_size,
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            n_steps=n_steps,
+            target_update_interval=target_update_interval,
+            random_shift=random_shift,
+            dataset_storage=dataset_storage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+        )
+        self.beta = beta
+        self.n_action_samples = n_action_samples
+        self.mu = mu
+        self.penalty_space = penalty_space
+        self.omega_max = omega_max
+        self.class_prior = class_prior
+        self.initial_odds = initial_odds
+        self.backup = backup
+        self.policy_extraction = policy_extraction
+        self.temperature = temperature
+        self.advantage_floor = advantage_floor
+        self.weight_max = weight_max
+        self.ent_coef = ent_coef
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise TypeError(f"{type(self).__name__}: {name} is {getattr(self, name)!r}; choose one of {choices}")
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self.needs_next_actions = self.backup == "dataset"
+        self.policy_kwargs.setdefault("critic_output_bias", math.log(self.initial_odds))
+        if self.policy_extraction == "weighted":
+            self.policy_kwargs.setdefault("critic_state_value", True)
+            self.policy_kwargs.setdefault("std_min", 0.05)
+        super()._setup_model()
+
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            features = self.critic.encode(self.augment(batch.observations))
+            example_features = self.critic.encode(self.augment(self.sample_examples()))
+            # The policy reads the critic's features and does not train them.
+            policy_features = features.detach()
+            with th.no_grad():
+                example_actions, _ = self.actor.sample(example_features)
+                discounted_omega = self._discounted_omega(batch)
+
+            data_logits = self.critic.values(features, batch.actions)
+            example_logits = self.critic.values(example_features, example_actions)
+
+            # Eq. 10
+            term_c = recursive_loss(data_logits, discounted_omega)
+            term_b = example_loss(example_logits, self.gamma, self.class_prior)
+            critic_loss = term_c + term_b
+            if self.beta > 0:
+                sampled_logits = self.critic.values(features, self._sample_penalized_actions(policy_features))
+                term_a = conservative_penalty(data_logits, sampled_logits, self.penalty_space)
+                critic_loss = critic_loss + self.beta * term_a
+                self._record(penalty=term_a, classifier_penalized=sampled_logits.sigmoid().mean())
+            if self.policy_extraction == "weighted":
+                # The same classification without the action: its odds are the mean over the data's actions.
+                state_logits = self.critic.state_values(features)
+                example_state_logits = self.critic.state_values(example_features)
+                critic_loss = critic_loss + recursive_loss(state_logits.unsqueeze(0), discounted_omega)
+                critic_loss = critic_loss + example_loss(example_state_logits.unsqueeze(0), self.gamma, self.class_prior)
+            self._optimize(self.critic.optimizer, critic_loss)
+
+            if self.policy_extraction == "weighted":
+                weights = advantage_weights(
+                    data_logits.detach(),
+                    state_logits.detach(),
+                    example_logits.detach(),
+                    self.temperature,
+                    self.advantage_floor,
+                    self.weight_max,
+                )
+                actor_loss = (weights * self.actor.regression_loss(policy_features, batch.actions)).mean()
+                self._record(effective_weights=weights.sum() ** 2 / weights.pow(2).sum() / batch_size)
+            else:  # Eq. 11
+                actions, log_prob = self.actor.sample(policy_features)
+                classifier = self.critic.values(policy_features, actions).amin(dim=0).sigmoid()
+                actor_loss = (self.ent_coef * log_prob - classifier).mean()
+            self._optimize(self.actor.optimizer, actor_loss)
+
+            self._n_updates += 1
+            self._update_target()
+            self._record(
+                critic_loss=critic_loss,
+                actor_loss=actor_loss,
+                classifier_data=data_logits.sigmoid().mean(),
+                classifier_examples=example_logits.sigmoid().mean(),
+            )
+            if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
+                self._record_diagnostics(policy_features, discounted_omega / self.gamma)
+
+    def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
+        """
+        Eq. 3 times its discount: what term (c) takes as the positive weight of each transition.
+
+        :param batch: transitions
+        :return: ``(batch,)``
+        """
+        one_step = batch.discounts.squeeze(1) * self._omega(batch.next_observations, batch.next_actions)
+        if self.n_steps == 1:
+            return one_step
+        assert batch.nstep_observations is not None and batch.nstep_discounts is not None
+        n_step = batch.nstep_discounts.squeeze(1) * self._omega(batch.nstep_observations, batch.nstep_actions)
+        return 0.5 * (one_step + n_step)
+
+    def _omega(self, observations: PyTorchObs, dataset_actions: th.Tensor | None) -> th.Tensor:
+        return success_odds(self._target_logits(observations, dataset_actions), self.omega_max)
+
+    def _target_logits(self, observations: PyTorchObs, dataset_actions: th.Tensor | None) -> th.Tensor:
+        observations = self.augment(observations)
+        if self.backup == "policy":
+            actions, _ = self.actor.sample(self.actor.encode(observations))
+        else:
+            assert dataset_actions is not None
+            actions = dataset_actions
+        return self.critic_target.values(self.critic_target.encode(observations), actions)
+
+    def _sample_penalized_actions(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: ``(batch, features_dim)``
+        :return: K actions from mu for each state, ``(batch, K, action_dim)``, no gradient
+        """
+        n_policy = {"uniform": 0, "mixture": self.n_action_samples // 2, "policy": self.n_action_samples}[self.mu]
+        action_dim = self.actor.action_space.shape[0]
+        uniform = 2.0 * th.rand(len(features), self.n_action_samples - n_policy, action_dim, device=self.device) - 1.0
+        if n_policy == 0:
+            return uniform
+        with th.no_grad():
+            return th.cat([uniform, self.actor.sample(features, n_policy)[0]], dim=1)
+
+    @th.no_grad()
+    def _record_diagnostics(self, features: th.Tensor, omega: th.Tensor) -> None:
+        actions, log_prob = self.actor.sample(features)
+        p50, p99 = th.quantile(omega, th.tensor([0.5, 0.99], device=omega.device))
+        self._record(
+            log_prob=log_prob.mean(),
+            classifier_policy=self.critic.values(features, actions).amin(dim=0).sigmoid().mean(),
+            omega_p50=p50,
+            omega_p99=p99,
+            omega_clipped=(omega >= 0.5 * self.omega_max).float().mean(),
+        )
+
+    def learn(
+        self: SelfCEBORL,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1000,
+        tb_log_name: str = "CEBORL",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCEBORL:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "critic", "critic_target"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []

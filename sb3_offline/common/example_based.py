@@ -1,0 +1,73 @@
+"""What algorithms share that learn from examples of success instead of rewards."""
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
+
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.data.examples import load_examples
+from sb3_offline.data.reader import DatasetSource
+
+ExampleSource = str | PathLike | np.ndarray | dict[str, np.ndarray]
+
+
+class ExampleBasedAlgorithm(OfflineAlgorithm):
+    """
+    The base for algorithms that are given observations of a completed task, S*, beside the unlabelled dataset.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param dataset: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param examples: success examples: a folder of pictures, an ``.npz`` or HDF5 file, or an array ``(n, *observation)``
+        (a dict of arrays for dict observations). Arrays are not saved with the model; give them again to ``load``.
+    :param example_batch_size: examples in a batch
+    :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        example_batch_size: int = 256,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, dataset, **kwargs)
+        # Plain attributes for the same reason as `dataset`: `load(path, examples=...)` replaces them.
+        self.examples = examples
+        self.example_batch_size = example_batch_size
+        self._example_arrays: dict[str, np.ndarray] | None = None
+
+    def sample_examples(self) -> PyTorchObs:
+        """
+        :return: ``example_batch_size`` success examples, drawn with replacement, like a batch of observations
+        """
+        if self._example_arrays is None:
+            self._example_arrays = self._load_examples()
+        arrays = self._example_arrays
+        rng = self.replay_buffer.rng
+        rows = rng.integers(len(next(iter(arrays.values()))), size=self.example_batch_size)
+        batch = {key: th.as_tensor(array[rows], device=self.device) for key, array in arrays.items()}
+        return batch if isinstance(self.observation_space, spaces.Dict) else batch[""]
+
+    def _load_examples(self) -> dict[str, np.ndarray]:
+        if self.examples is None:
+            raise RuntimeError(
+                f"{type(self).__name__} has no success examples to learn from: pass `examples=` to the constructor, "
+                "or `load(path, examples=...)`"
+            )
+        examples = load_examples(self.examples, self.observation_space)
+        if self._vec_normalize_env is not None:
+            self.replay_buffer  # noqa: B018  (the statistics are fitted when the dataset is opened)
+            examples = self._vec_normalize_env.normalize_obs(examples)
+        return examples if isinstance(examples, dict) else {"": examples}
+
+    def _excluded_save_params(self) -> list[str]:
+        excluded = [*super()._excluded_save_params(), "_example_arrays"]
+        return excluded if isinstance(self.examples, (str, PathLike)) else [*excluded, "examples"]
