@@ -44,11 +44,11 @@ class Script(NamedTuple):
 
 
 SCRIPTS = {
-    "dial-turn": Script(policies.SawyerDialTurnV3Policy, 1.0, 16, (0.05, 0.25), 0.38),
-    "door-open": Script(policies.SawyerDoorOpenV3Policy, 1.0, 20, (0.1, 0.5), 0.20),
-    "drawer-open": Script(policies.SawyerDrawerOpenV3Policy, 1.0, 20, (0.1, 0.5), 0.29),
+    "dial-turn": Script(policies.SawyerDialTurnV3Policy, 1.0, 16, (0.03, 0.2), 0.37),
+    "door-open": Script(policies.SawyerDoorOpenV3Policy, 1.0, 20, (0.03, 0.3), 0.28),
+    "drawer-open": Script(policies.SawyerDrawerOpenV3Policy, 1.0, 20, (0.03, 0.3), 0.29),
     "lever-pull": Script(policies.SawyerLeverPullV3Policy, 0.5, 36, (0.03, 0.15), 0.34, lets_go=True),
-    "plate-slide": Script(policies.SawyerPlateSlideV3Policy, 1.0, 23, (0.1, 0.5), 0.32),
+    "plate-slide": Script(policies.SawyerPlateSlideV3Policy, 1.0, 23, (0.03, 0.3), 0.31),
 }
 
 # How the other attempts go.
@@ -89,11 +89,11 @@ class _Attempt:
         straight = rng.random() < self._script.straight
         manner = "straight" if straight else rng.choice(list(_FAILINGS), p=list(_FAILINGS.values()))
         self._speed = rng.uniform(0.8, 1.0)
-        self._noise = rng.uniform(0.7, 1.3) if manner == "clumsy" else rng.uniform(*self._script.noise)
+        self._noise = rng.uniform(*{"straight": self._script.noise, "clumsy": (0.9, 1.5)}.get(manner, (0.1, 0.5)))
         self._aim = np.zeros(3)
         if manner == "misaimed":
             direction = rng.normal(size=3) * (1.0, 1.0, 0.5)
-            self._aim = direction / np.linalg.norm(direction) * rng.uniform(0.05, 0.12)
+            self._aim = direction / np.linalg.norm(direction) * rng.uniform(0.09, 0.18)
         self._end = rng.integers(1, int(0.85 * self._script.n_decisions)) if manner == "aborted" else None
         self._rests_after_success = self._script.lets_go or rng.random() < 0.5
         self._afterwards = rng.choice(["rest", "drift", "leave"])
