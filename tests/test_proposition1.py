@@ -6,7 +6,7 @@ is a linear system: no sampling, no tolerance for noise. Solved exactly, the pro
 identity (Eq. 18) holds, but the step to Eq. 19 takes delta = beta C - p to be the same for all actions, which it is not.
 What is true, and tested here:
 
-- beta = 1 + p makes delta zero: the penalty then cancels the density ratio of Eq. 7 exactly, and the bound holds with equality;
+- beta = 1 + p makes delta zero: the penalty cancels the density ratio of Eq. 7 exactly, and the bound holds with equality;
 - a beta far above that breaks the bound, since the penalty's second half *raises* C on actions of the data;
 - without that second half (``-E_D[C]``) the odds fall with beta, and the bound holds from some beta on.
 """

@@ -1,17 +1,15 @@
 """Behavioral cloning."""
 
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.bc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.policies import OfflineActor
 from sb3_offline.data.reader import DatasetSource
-
-SelfBC = TypeVar("SelfBC", bound="BC")
 
 
 class BC(OfflineAlgorithm):
@@ -98,14 +96,3 @@ class BC(OfflineAlgorithm):
 
             self._n_updates += 1
             self._record(actor_loss=actor_loss)
-
-    def learn(
-        self: SelfBC,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1000,
-        tb_log_name: str = "BC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfBC:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

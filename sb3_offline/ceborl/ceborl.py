@@ -1,11 +1,11 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 import math
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
 from sb3_offline.ceborl.losses import (
     advantage_weights,
@@ -20,8 +20,6 @@ from sb3_offline.common.policies import OfflineActor, OfflineCritic, OfflinePoli
 from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.reader import DatasetSource
 
-SelfCEBORL = TypeVar("SelfCEBORL", bound="CEBORL")
-
 #: The paper's Eq. 10 and 11 to the letter, as constructor arguments.
 PAPER_FORM: dict[str, Any] = {
     "backup": "policy",
@@ -30,6 +28,7 @@ PAPER_FORM: dict[str, Any] = {
     "beta": 0.1,
     "tau": 0.005,
     "initial_odds": 1.0,
+    "example_share": 0.0,
 }
 
 _CHOICES = {
@@ -75,6 +74,9 @@ class CEBORL(ExampleBasedAlgorithm):
     :param penalty_space: penalise the ``"probability"`` C or the ``"logit"``
     :param omega_max: bound of omega against overflow; values of 20 to 60 are normal, so keep it far above
     :param class_prior: weight of the examples in (b), p(e = 1); the paper drops it (1.0)
+    :param example_share: weight of the examples among the data of (c). The odds estimate the ratio of two densities, examples
+        over data, which is unbounded where the data have none; with a share eta of examples it is at most 1 / eta (the
+        "relative" density ratio).
     :param initial_odds: odds of the untrained classifier. A network's usual first output, 0, means odds of 1, far above the
         truth; discounting takes thousands of steps to bring them down, and until then they look like success.
     :param backup: next action a' of omega: the ``"dataset"``'s, or the ``"policy"``'s as in the paper
@@ -124,6 +126,7 @@ class CEBORL(ExampleBasedAlgorithm):
         penalty_space: str = "probability",
         omega_max: float = 1e4,
         class_prior: float = 1.0,
+        example_share: float = 0.02,
         initial_odds: float = 0.01,
         backup: str = "dataset",
         policy_extraction: str = "weighted",
@@ -169,6 +172,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.penalty_space = penalty_space
         self.omega_max = omega_max
         self.class_prior = class_prior
+        self.example_share = example_share
         self.initial_odds = initial_odds
         self.backup = backup
         self.policy_extraction = policy_extraction
@@ -203,19 +207,20 @@ class CEBORL(ExampleBasedAlgorithm):
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             features = self.critic.encode(self.augment(batch.observations))
-            example_features = self.critic.encode(self.augment(self.sample_examples()))
+            examples = self.augment(self.sample_examples())
+            example_features = self.critic.encode(examples)
             # The policy reads the critic's features and does not train them.
             policy_features = features.detach()
             with th.no_grad():
                 example_actions, _ = self.actor.sample(example_features)
                 discounted_omega = self._discounted_omega(batch)
-
-            data_logits = self.critic.values(features, batch.actions)
-            example_logits = self.critic.values(example_features, example_actions)
+                example_omega = self._example_omega(examples, example_actions)
 
             # Eq. 10
+            data_logits = self.critic.values(features, batch.actions)
+            example_logits = self.critic.values(example_features, example_actions)
             term_c = recursive_loss(data_logits, discounted_omega)
-            term_b = example_loss(example_logits, self.gamma, self.class_prior)
+            term_b = self._example_term(example_logits, example_omega)
             critic_loss = term_c + term_b
             if self.beta > 0:
                 sampled_logits = self.critic.values(features, self._sample_penalized_actions(policy_features))
@@ -225,9 +230,10 @@ class CEBORL(ExampleBasedAlgorithm):
             if self.policy_extraction == "weighted":
                 # The same classification without the action: its odds are the mean over the data's actions.
                 state_logits = self.critic.state_values(features)
-                example_state_logits = self.critic.state_values(example_features)
                 critic_loss = critic_loss + recursive_loss(state_logits.unsqueeze(0), discounted_omega)
-                critic_loss = critic_loss + example_loss(example_state_logits.unsqueeze(0), self.gamma, self.class_prior)
+                critic_loss = critic_loss + self._example_term(
+                    self.critic.state_values(example_features).unsqueeze(0), example_omega
+                )
             self._optimize(self.critic.optimizer, critic_loss)
 
             if self.policy_extraction == "weighted":
@@ -272,6 +278,20 @@ class CEBORL(ExampleBasedAlgorithm):
         n_step = batch.nstep_discounts.squeeze(1) * self._omega(batch.nstep_observations, batch.nstep_actions)
         return 0.5 * (one_step + n_step)
 
+    def _example_omega(self, examples: PyTorchObs, actions: th.Tensor) -> th.Tensor | None:
+        """:return: ``gamma * omega`` of examples as their own successors, where they count among the data"""
+        if self.example_share == 0:
+            return None
+        target_logits = self.critic_target.values(self.critic_target.encode(examples), actions)
+        return self.gamma * success_odds(target_logits, self.omega_max)
+
+    def _example_term(self, logits: th.Tensor, example_omega: th.Tensor | None) -> th.Tensor:
+        """Term (b), and the examples' part of (c), which bounds the odds by ``1 / example_share``."""
+        loss = example_loss(logits, self.gamma, self.class_prior)
+        if example_omega is not None:
+            loss = loss + self.example_share * recursive_loss(logits, example_omega)
+        return loss
+
     def _omega(self, observations: PyTorchObs, dataset_actions: th.Tensor | None) -> th.Tensor:
         return success_odds(self._target_logits(observations, dataset_actions), self.omega_max)
 
@@ -308,17 +328,6 @@ class CEBORL(ExampleBasedAlgorithm):
             omega_p99=p99,
             omega_clipped=(omega >= 0.5 * self.omega_max).float().mean(),
         )
-
-    def learn(
-        self: SelfCEBORL,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1000,
-        tb_log_name: str = "CEBORL",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCEBORL:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "critic", "critic_target"]

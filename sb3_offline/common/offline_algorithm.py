@@ -173,12 +173,12 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     # -------------------------------------------------------------- learning
 
-    def learn(
+    def learn(  # type: ignore[override]
         self: SelfOfflineAlgorithm,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 1000,
-        tb_log_name: str = "run",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfOfflineAlgorithm:
@@ -188,11 +188,12 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         :param total_timesteps: The number of gradient steps
         :param callback: callback(s) called after every gradient step
         :param log_interval: gradient steps between two dumps of the log (``None``: never)
-        :param tb_log_name: the name of the run for TensorBoard logging
+        :param tb_log_name: the name of the run for TensorBoard logging (default: the algorithm's)
         :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
         :param progress_bar: Display a progress bar using tqdm and rich.
         :return: the trained model
         """
+        tb_log_name = tb_log_name or type(self).__name__
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

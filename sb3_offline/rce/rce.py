@@ -40,7 +40,13 @@ class RCE(CEBORL):
         tau: float = 0.005,
         **kwargs: Any,
     ):
-        defaults = {"beta": 0.0, "backup": "policy", "policy_extraction": "maximize", "initial_odds": 1.0}
+        defaults: dict[str, Any] = {
+            "beta": 0.0,
+            "backup": "policy",
+            "policy_extraction": "maximize",
+            "initial_odds": 1.0,
+            "example_share": 0.0,
+        }
         super().__init__(policy, env, dataset, examples, n_steps=n_steps, tau=tau, **{**defaults, **kwargs})
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:

@@ -1,0 +1,167 @@
+"""The command ``sb3-offline``: parse, call the library, print."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ENV_ID = "MultimodalMetaworld-v0"
+
+
+def main(argv: list[str] | None = None) -> None:
+    """:param argv: the command line, default ``sys.argv``"""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    from sb3_offline.data.errors import DatasetError
+
+    try:
+        arguments.run(arguments)
+    except (DatasetError, RuntimeError, FileExistsError) as error:
+        sys.exit(f"sb3-offline: {error}")
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            raise
+        sys.exit(f'sb3-offline: {error}; install it with: pip install "sb3-offline[{extra}]"')
+
+
+_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots", "imageio": "plots"}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="sb3-offline", description="Offline reinforcement learning for Stable-Baselines3")
+    commands = parser.add_subparsers(required=True, metavar="command")
+    _add(commands, "collect", "roll out the scripted policies, with noise and aborted attempts", _collect)
+    _add(commands, "examples", "take success examples out of a labelled dataset", _tool("extract_examples"))
+    _add(commands, "inspect", "say what is in a dataset and what looks wrong", _tool("inspect_dataset"))
+    _add(commands, "convert", "compress a dataset, or lay it out raw for training", _tool("convert_dataset"))
+    _add(commands, "train", "train one policy", _train)
+    _add(commands, "evaluate", "play a trained policy", _evaluate)
+    _add(commands, "demo", "collect, train, evaluate and report, all by itself", _demo)
+    return parser
+
+
+def _add(commands: Any, name: str, text: str, setup: Callable[[argparse.ArgumentParser], Callable]) -> None:
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser.set_defaults(run=setup(parser))
+
+
+def _tool(name: str) -> Callable[[argparse.ArgumentParser], Callable]:
+    """A program of the data tools, which brings its own options."""
+
+    def setup(parser: argparse.ArgumentParser) -> Callable:
+        import importlib
+
+        module = importlib.import_module(f"sb3_offline.data_tools.{name}")
+        module.add_arguments(parser)
+        return module.run
+
+    return setup
+
+
+def _collect(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("output", help="HDF5 file to write")
+    parser.add_argument("--episodes-per-task", type=int, default=300)
+    parser.add_argument("--tasks", nargs="+", help="default: all five")
+    parser.add_argument("--obs-type", choices=("state", "pixels"), default="state")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2, help="processes; the file is the same for any number")
+    parser.add_argument("--overwrite", action="store_true")
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.data_tools.collect_scripted import TASKS, collect_scripted
+
+        shares = collect_scripted(
+            args.output,
+            episodes_per_task=args.episodes_per_task,
+            tasks=args.tasks or TASKS,
+            obs_type=args.obs_type,
+            seed=args.seed,
+            n_workers=args.workers,
+            mode="w" if args.overwrite else "x",
+        )
+        for task, share in shares.items():
+            print(f"{task:<12} {share:6.1%} of the episodes solved")
+
+    return run
+
+
+def _train(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("--algo", default="ceborl", help="ceborl, rce, bc")
+    parser.add_argument("--env", default=ENV_ID)
+    parser.add_argument("--task", help="of the multimodal environment, e.g. door-open")
+    parser.add_argument("--config", help="a shipped config's name or a YAML file (default: the algorithm's)")
+    parser.add_argument("--dataset", nargs="+", required=True, help="dataset files or patterns")
+    parser.add_argument("--examples", help="folder of pictures, .npz or HDF5 file")
+    parser.add_argument("-n", "--n-timesteps", type=int, help="gradient steps (default: the config's)")
+    parser.add_argument("--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="overwrite the config's")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--eval-freq", type=int, default=0, help="gradient steps between evaluations (default: none)")
+    parser.add_argument("--eval-episodes", type=int, default=20)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the model and its tables")
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.experiment.config import load_config, parse_overrides
+        from sb3_offline.experiment.training import train
+
+        config = {**load_config(args.config or args.algo, args.env), **parse_overrides(args.hyperparams)}
+        if args.n_timesteps:
+            config["n_timesteps"] = args.n_timesteps
+        train(
+            args.algo,
+            args.env,
+            config,
+            args.output,
+            dataset=args.dataset if len(args.dataset) > 1 else args.dataset[0],
+            examples=args.examples,
+            env_kwargs={"task": args.task} if args.task else {},
+            seed=args.seed,
+            eval_freq=args.eval_freq,
+            n_eval_episodes=args.eval_episodes,
+            verbose=1,
+        )
+        print(f"Saved {args.output / 'model.zip'}")
+
+    return run
+
+
+def _evaluate(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("model", type=Path, help="model.zip of a run")
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=100_000, help="of the episodes")
+    parser.add_argument("--gif", type=Path, help="record some of them")
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.experiment.evaluation import evaluate_success
+        from sb3_offline.experiment.training import load_run
+
+        model, run_config = load_run(args.model)
+        result = evaluate_success(model, run_config["env"], run_config["env_kwargs"], args.episodes, args.seed)
+        low, high = result.interval
+        print(f"{sum(result.successes)} of {args.episodes} episodes solved: {result.success_rate:.2f} [{low:.2f}, {high:.2f}]")
+        if args.gif:
+            from sb3_offline.experiment.recording import record_gif
+
+            record_gif(model, run_config["env"], run_config["env_kwargs"], args.gif, seed=args.seed)
+            print(f"Saved {args.gif}")
+
+    return run
+
+
+def _demo(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("--task", default="drawer-open")
+    parser.add_argument("--obs-type", choices=("state", "pixels"), default="state")
+    parser.add_argument("-o", "--output", type=Path, default=Path("demo"))
+    parser.add_argument("--seed", type=int, default=0)
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.demo.pipeline import run_demo
+
+        print(run_demo(args.output, task=args.task, obs_type=args.obs_type, seed=args.seed))
+
+    return run
+
+
+if __name__ == "__main__":
+    main()

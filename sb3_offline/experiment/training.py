@@ -1,0 +1,146 @@
+"""One training run: a config, a dataset and examples become checkpoints and a table of evaluations."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+
+import sb3_offline
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.experiment.evaluation import Evaluation, evaluate_success
+
+EVALUATION_FIELDS = ("step", "episodes", "successes", "mean_return")
+
+
+class EvaluationTable(BaseCallback):
+    """
+    Evaluates at regular steps and appends a row to a CSV file each time.
+
+    :param path: of the CSV file, written anew
+    :param env_id: registered id
+    :param env_kwargs: of the environment
+    :param eval_freq: gradient steps between evaluations
+    :param n_episodes: episodes of each
+    :param verbose: 1 prints each success rate
+    """
+
+    def __init__(self, path: Path, env_id: str, env_kwargs: dict[str, Any], eval_freq: int, n_episodes: int, verbose: int = 0):
+        super().__init__(verbose)
+        self.path, self.env_id, self.env_kwargs = path, env_id, env_kwargs
+        self.eval_freq, self.n_episodes = eval_freq, n_episodes
+
+    def _on_training_start(self) -> None:
+        with self.path.open("w", newline="") as file:
+            csv.writer(file).writerow(EVALUATION_FIELDS)
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.eval_freq == 0:
+            result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes)
+            with self.path.open("a", newline="") as file:
+                csv.writer(file).writerow(evaluation_row(self.num_timesteps, result))
+            self.logger.record("eval/success_rate", result.success_rate)
+            if self.verbose:
+                print(f"step {self.num_timesteps}: {sum(result.successes)} of {self.n_episodes} episodes solved")
+        return True
+
+
+def evaluation_row(step: int, result: Evaluation) -> tuple[int, int, int, float]:
+    """
+    :param step: gradient steps so far
+    :param result: of that checkpoint
+    :return: values of :data:`EVALUATION_FIELDS`
+    """
+    mean_return = sum(result.returns) / len(result.returns)
+    return step, len(result.successes), sum(result.successes), round(mean_return, 3)
+
+
+def create_model(
+    algo: str,
+    config: dict[str, Any],
+    dataset: Any,
+    examples: Any = None,
+    seed: int = 0,
+    **kwargs: Any,
+) -> OfflineAlgorithm:
+    """
+    :param algo: name in :data:`sb3_offline.ALGOS`
+    :param config: as :func:`~sb3_offline.experiment.config.load_config` returns it
+    :param dataset: dataset path(s)
+    :param examples: success examples, for the algorithms that learn from them
+    :param seed: of the run
+    :param kwargs: further constructor arguments
+    :return: a model, not trained
+    """
+    if algo not in sb3_offline.ALGOS:
+        raise RuntimeError(f"There is no algorithm {algo!r}; choose one of {', '.join(sb3_offline.ALGOS)}")
+    arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs")}
+    arguments.update(dataset=dataset, seed=seed, **kwargs)
+    if examples is not None:
+        arguments["examples"] = examples
+    return sb3_offline.ALGOS[algo](env=None, **arguments)  # type: ignore[arg-type]
+
+
+def train(
+    algo: str,
+    env_id: str,
+    config: dict[str, Any],
+    output: Path,
+    *,
+    dataset: Any,
+    examples: Any = None,
+    env_kwargs: dict[str, Any] | None = None,
+    seed: int = 0,
+    eval_freq: int = 0,
+    n_eval_episodes: int = 20,
+    progress_bar: bool = True,
+    verbose: int = 0,
+) -> OfflineAlgorithm:
+    """
+    Train one model and leave ``model.zip``, ``config.yml`` and, with ``eval_freq``, ``evaluations.csv`` in a folder.
+
+    :param algo: name in :data:`sb3_offline.ALGOS`
+    :param env_id: environment to evaluate in
+    :param config: as :func:`~sb3_offline.experiment.config.load_config` returns it
+    :param output: folder, created
+    :param dataset: dataset path(s)
+    :param examples: success examples, for the algorithms that learn from them
+    :param env_kwargs: added to the config's
+    :param seed: of the run
+    :param eval_freq: gradient steps between evaluations (0: none)
+    :param n_eval_episodes: episodes of each evaluation
+    :param progress_bar: whether to show one
+    :param verbose: 1 for info messages
+    :return: the trained model
+    """
+    # Saturated classifiers make denormal numbers, which are many times slower.
+    th.set_flush_denormal(True)
+    output.mkdir(parents=True, exist_ok=True)
+    all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
+    model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
+    record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, "dataset": str(dataset)}
+    if isinstance(examples, (str, Path)):
+        record["examples"] = str(examples)
+    (output / "config.yml").write_text(yaml.safe_dump(json.loads(json.dumps(record)), sort_keys=False))
+    callback = None
+    if eval_freq:
+        callback = EvaluationTable(output / "evaluations.csv", env_id, all_env_kwargs, eval_freq, n_eval_episodes, verbose)
+    model.learn(config["n_timesteps"], callback=callback, progress_bar=progress_bar)
+    model.save(output / "model.zip")
+    return model
+
+
+def load_run(model_path: Path) -> tuple[OfflineAlgorithm, dict[str, Any]]:
+    """
+    :param model_path: ``model.zip`` that :func:`train` left, its ``config.yml`` beside it
+    :return: the model and its config
+    """
+    config_file = model_path.with_name("config.yml")
+    for file in (model_path, config_file):
+        if not file.is_file():
+            raise RuntimeError(f"{file}: there is no such file; give the model.zip in the folder of a training run")
+    config = yaml.safe_load(config_file.read_text())
+    return sb3_offline.ALGOS[config["algo"]].load(model_path), config

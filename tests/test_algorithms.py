@@ -1,0 +1,236 @@
+"""One conformance test for every algorithm, over vector, image and dict observations."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from data_files import ACTIONS, write_dataset
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_offline import ALGOS, RCE
+from sb3_offline.common.torch_layers import StandardizedExtractor
+from sb3_offline.data.errors import DatasetError
+
+STATES = spaces.Box(-5, 5, (3,), np.float32)
+IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
+BOTH = spaces.Dict({"image": IMAGES, "state": STATES})
+POLICIES = {"MlpPolicy": STATES, "CnnPolicy": IMAGES, "MultiInputPolicy": BOTH}
+CASES = [(algo, policy) for algo in ALGOS for policy in POLICIES]
+
+
+class ForbiddenEnv(gym.Env):
+    """Fails the test if a learner steps or resets it; `allowed` lets an evaluation do so."""
+
+    def __init__(self, observation_space, allowed=False):
+        self.observation_space, self.action_space, self.allowed = observation_space, ACTIONS, allowed
+
+    def reset(self, *, seed=None, options=None):
+        assert self.allowed, "a learner reset the environment"
+        self.steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.allowed, "a learner stepped the environment"
+        assert self.action_space.contains(action)
+        self.steps += 1
+        return self.observation_space.sample(), 1.0, False, self.steps == 5, {"is_success": True}
+
+
+class CountSteps(BaseCallback):
+    """Checks the order of training and callbacks, and stops early."""
+
+    def __init__(self, stop_at=10**9):
+        super().__init__()
+        self.stop_at = stop_at
+
+    def _on_step(self):
+        assert self.num_timesteps == self.model._n_updates  # trained before the callback
+        return self.num_timesteps < self.stop_at
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A small dataset and examples for each kind of observation."""
+    folder = tmp_path_factory.mktemp("data")
+    result = {}
+    for policy, space in POLICIES.items():
+        write_dataset(folder / f"{policy}.h5", 6, space)
+        space.seed(0)
+        samples = [space.sample() for _ in range(5)]
+        examples = np.stack(samples) if not isinstance(space, spaces.Dict) else None
+        if examples is None:
+            examples = {key: np.stack([sample[key] for sample in samples]) for key in space}
+        result[policy] = (str(folder / f"{policy}.h5"), examples)
+    return result
+
+
+def make(algo, policy, files, env=None, **kwargs):
+    dataset, examples = files[policy]
+    if algo != "bc":
+        kwargs = {"examples": examples, "example_batch_size": 4, **kwargs}
+    small = {"net_arch": [16, 16]}
+    if policy == "CnnPolicy":
+        small["features_extractor_kwargs"] = {"features_dim": 16}
+    elif policy == "MultiInputPolicy":
+        small["features_extractor_kwargs"] = {"cnn_output_dim": 16}
+    return ALGOS[algo](policy, env, dataset, batch_size=8, seed=3, policy_kwargs=small, **kwargs)
+
+
+def batch_of(space, n=4):
+    space.seed(1)
+    samples = [space.sample() for _ in range(n)]
+    return {k: np.stack([s[k] for s in samples]) for k in space} if isinstance(space, spaces.Dict) else np.stack(samples)
+
+
+@pytest.mark.parametrize(("algo", "policy"), CASES)
+def test_learn_predict_save_load_go_on(algo, policy, files, tmp_path):
+    space = POLICIES[policy]
+    model = make(algo, policy, files, env=ForbiddenEnv(space))
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(3, log_interval=1)
+    changed = {name.split(".")[0] for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
+    assert changed == ({"actor"} if algo == "bc" else {"actor", "critic", "critic_target"})
+    observations = batch_of(space)
+    actions, _ = model.predict(observations, deterministic=True)
+    assert actions.shape == (4, *ACTIONS.shape) and all(ACTIONS.contains(action) for action in actions)
+
+    model.save(tmp_path / "model")
+    loaded = ALGOS[algo].load(tmp_path / "model")  # no dataset, no environment: good for prediction
+    np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
+    kwargs = {} if algo == "bc" else {"examples": files[policy][1]}
+    again = ALGOS[algo].load(tmp_path / "model", env=ForbiddenEnv(space), **kwargs)
+    again.learn(2, reset_num_timesteps=False)
+    assert again.num_timesteps == again._n_updates == 5
+
+
+@pytest.mark.parametrize(("algo", "policy"), CASES)
+def test_the_seed_decides(algo, policy, files):
+    weights = [make(algo, policy, files).learn(2).policy.state_dict() for _ in range(2)]
+    for name, value in weights[0].items():
+        assert th.equal(value, weights[1][name]), name
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_callbacks_logger_and_evaluation(algo, files, tmp_path):
+    env = Monitor(ForbiddenEnv(STATES, allowed=True))
+    evaluation = EvalCallback(env, eval_freq=4, n_eval_episodes=2, log_path=tmp_path, best_model_save_path=tmp_path)
+    checkpoints = CheckpointCallback(save_freq=5, save_path=tmp_path)
+    model = make(algo, "MlpPolicy", files, tensorboard_log=str(tmp_path / "tb"))
+    model.learn(10, callback=[evaluation, checkpoints, CountSteps()], log_interval=5, progress_bar=True)
+    assert (tmp_path / "rl_model_10_steps.zip").is_file() and (tmp_path / "best_model.zip").is_file()
+    assert len(np.load(tmp_path / "evaluations.npz")["successes"]) == 2
+    assert next((tmp_path / "tb").glob(f"{algo.upper()}_1/*")).stat().st_size > 0
+    assert evaluate_policy(model, env, n_eval_episodes=2)[0] == 5.0
+    model.learn(100, callback=CountSteps(stop_at=14), reset_num_timesteps=False)
+    assert model.num_timesteps == 14
+
+
+def test_no_environment_says_so(files):
+    model = make("bc", "MlpPolicy", files)
+    assert model.observation_space == STATES and model.action_space == ACTIONS
+    with pytest.raises(RuntimeError, match="no environment"):
+        model.get_env().reset()
+    model.set_env(ForbiddenEnv(STATES, allowed=True))
+    model.get_env().reset()
+
+
+def test_what_is_missing_or_wrong_is_named(files, tmp_path):
+    dataset, examples = files["MlpPolicy"]
+    with pytest.raises(TypeError, match="CEBORL needs `dataset=` or `env=`"):
+        ALGOS["ceborl"]("MlpPolicy")
+    with pytest.raises(DatasetError, match=r"nowhere\.h5"):
+        ALGOS["ceborl"]("MlpPolicy", None, str(tmp_path / "nowhere.h5"), examples)
+    with pytest.raises(RuntimeError, match="has no success examples"):
+        ALGOS["ceborl"]("MlpPolicy", None, dataset).learn(1)
+    with pytest.raises(RuntimeError, match="has no dataset"):
+        ALGOS["ceborl"]("MlpPolicy", ForbiddenEnv(STATES), examples=examples).learn(1)
+    with pytest.raises(DatasetError, match="the learner has"):
+        ALGOS["bc"]("MlpPolicy", ForbiddenEnv(spaces.Box(-1, 1, (7,), np.float32)), dataset).learn(1)
+    with pytest.raises(TypeError, match=r"backup is 'expert'.*dataset.*policy"):
+        ALGOS["ceborl"]("MlpPolicy", None, dataset, examples, backup="expert")
+
+
+def test_vectors_are_standardised_by_the_dataset_and_stay_so_after_loading(files, tmp_path):
+    model = make("ceborl", "MlpPolicy", files).learn(1)
+    mean, variance, _ = model.replay_buffer.observation_statistics()
+    encoder = model.actor.features_extractor
+    assert isinstance(encoder, StandardizedExtractor) and encoder is model.critic.features_extractor
+    np.testing.assert_allclose(encoder.mean, mean, rtol=1e-5)
+    np.testing.assert_allclose(encoder.std, np.sqrt(variance), rtol=1e-5)
+    assert th.equal(encoder.mean, model.critic_target.features_extractor.mean)
+    model.save(tmp_path / "model")
+    assert th.equal(ALGOS["ceborl"].load(tmp_path / "model").actor.features_extractor.mean, encoder.mean)
+
+
+def test_vec_normalize_is_fitted_to_the_dataset(files):
+    env = VecNormalize(DummyVecEnv([lambda: ForbiddenEnv(STATES, allowed=True)]))
+    model = make("ceborl", "MlpPolicy", files, env=env).learn(1)
+    mean, variance, count = model.replay_buffer.observation_statistics()
+    np.testing.assert_allclose(env.obs_rms.mean, mean)
+    np.testing.assert_allclose(env.obs_rms.var, variance)
+    assert env.obs_rms.count == count
+    assert not model.actor.features_extractor.fitted  # not twice
+
+
+def test_pixels_the_critic_trains_the_encoder_and_the_actor_does_not(files):
+    model = make("ceborl", "CnnPolicy", files)
+    batch = model.replay_buffer.sample(8)
+    before = [p.clone() for p in model.critic.features_extractor.parameters()]
+    features = model.actor.encode(batch.observations)
+    assert not features.requires_grad and model.critic.encode(batch.observations).requires_grad
+    model._optimize(model.actor.optimizer, model.actor.regression_loss(features, batch.actions).mean())
+    assert all(th.equal(a, b) for a, b in zip(before, model.critic.features_extractor.parameters(), strict=True))
+
+
+def test_critic_values_many_actions_as_one_by_one(files):
+    model = make("ceborl", "MlpPolicy", files)
+    features = th.randn(5, 3)
+    actions = th.rand(5, 7, ACTIONS.shape[0]) * 2 - 1
+    many = model.critic.values(features, actions)
+    one_by_one = th.stack([model.critic.values(features, actions[:, k]) for k in range(7)], dim=-1)
+    th.testing.assert_close(many, one_by_one)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rce_target_is_that_of_its_paper(n_steps, files):
+    model = make("rce", "MlpPolicy", files, n_steps=n_steps)
+    batch = model.replay_buffer.sample(8)
+    probabilities = iter([np.full((2, 8), 0.6), np.full((2, 8), 0.8)])
+    model._target_logits = lambda *_: th.logit(th.tensor(next(probabilities), dtype=th.float32))
+    omega = model._discounted_omega(batch).numpy()
+    mean = np.full(8, 0.6)
+    if n_steps == 3:
+        mean = 0.5 * (0.6 + batch.nstep_discounts.numpy()[:, 0] * 0.8)
+    np.testing.assert_allclose(omega, 0.99 * mean / (1 - mean), rtol=1e-4)
+    assert isinstance(model, RCE) and model.beta == 0
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"mu": "mixture"},
+        {"mu": "policy", "penalty_space": "logit"},
+        {"backup": "policy", "policy_extraction": "maximize", "n_steps": 1},
+        {"n_steps": 1, "beta": 0.0, "example_share": 0.0},
+    ],
+)
+def test_ceborl_variants_learn_and_log(kwargs, files):
+    model = make("ceborl", "MlpPolicy", files, n_action_samples=4, **kwargs)
+    model.learn(50, log_interval=None)
+    wanted = {
+        "classifier_data",
+        "classifier_examples",
+        "classifier_policy",
+        "omega_p50",
+        "omega_p99",
+        "omega_clipped",
+        "log_prob",
+    }
+    if model.beta:
+        wanted |= {"penalty", "classifier_penalized"}
+    assert wanted <= model._metrics.keys()
+    assert all(np.isfinite(float(total)) for total, _ in model._metrics.values())
