@@ -152,13 +152,23 @@ def _evaluate(parser: argparse.ArgumentParser) -> Callable:
 def _demo(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument("--task", default="drawer-open")
     parser.add_argument("--obs-type", choices=("state", "pixels"), default="state")
-    parser.add_argument("-o", "--output", type=Path, default=Path("demo"))
+    parser.add_argument("--episodes-per-task", type=int, default=300, help="in the dataset, of five tasks (default: 300)")
+    parser.add_argument("-n", "--n-timesteps", type=int, help="gradient steps of each method (default: the configs')")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-o", "--output", type=Path, default=Path("demo"))
 
     def run(args: argparse.Namespace) -> None:
-        from sb3_offline.demo.pipeline import run_demo
+        from sb3_offline.demo.pipeline import DemoSettings, run_demo
 
-        print(run_demo(args.output, task=args.task, obs_type=args.obs_type, seed=args.seed))
+        settings = DemoSettings(
+            task=args.task,
+            obs_type=args.obs_type,
+            episodes_per_task=args.episodes_per_task,
+            n_timesteps=args.n_timesteps,
+            seed=args.seed,
+        )
+        print(run_demo(args.output, settings))
+        print(f"Report: {args.output / 'report.md'}")
 
     return run
 

@@ -1,0 +1,49 @@
+# Every target does its own set-up: a virtual environment beside this file, and the system libraries that pictures need.
+VENV ?= .venv
+PYTHON ?= python3
+# The CPU build of PyTorch, so that no gigabytes of CUDA come along; `make TORCH=torch ...` takes your platform's default.
+TORCH ?= torch==2.13.0
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo demo-pixels test test-slow pytest lint type format check-codestyle commit-checks doc clean
+
+demo: $(READY)  ## the main job: collect, train CEBORL, evaluate, report into demo/ (about 15 minutes)
+	$(BIN)/sb3-offline demo --output demo
+
+demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (hours)
+	$(BIN)/sb3-offline demo --obs-type pixels --output demo-pixels
+
+test: $(READY)  ## all fast tests
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-slow: $(READY)  ## the tests that train for minutes
+	$(BIN)/python -m pytest -m slow
+
+pytest: test
+
+lint: $(READY)
+	$(BIN)/ruff check .
+
+type: $(READY)
+	$(BIN)/mypy sb3_offline data_tools
+
+format: $(READY)
+	$(BIN)/ruff check --select I --fix .
+	$(BIN)/black .
+
+check-codestyle: $(READY)
+	$(BIN)/ruff check --select I .
+	$(BIN)/black --check .
+
+commit-checks: format type lint
+
+doc: $(READY)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
+$(READY): setup.cfg pyproject.toml
+	PYTHON="$(PYTHON)" TORCH="$(TORCH)" sh .ci/setup "$(VENV)"
+	touch $@
+
+clean:
+	rm -rf build dist docs/_build .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,220 @@
+"""From nothing to a trained policy and a report in one folder."""
+
+import csv
+import json
+import platform
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+import sb3_offline
+from sb3_offline.ceborl import CEBORL
+from sb3_offline.data.examples import save_examples
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data_tools.collect_scripted import BEHAVIOUR, ENV_ID, TASKS, collect_scripted
+from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.demo import plots
+from sb3_offline.demo.trajectories import judge_trajectories, pick_trajectories
+from sb3_offline.experiment.config import load_config
+from sb3_offline.experiment.evaluation import evaluate_success, success_interval
+from sb3_offline.experiment.recording import record_gif
+from sb3_offline.experiment.training import train
+
+#: Rows of the table: label, algorithm, config.
+METHODS = {
+    "CEBORL": ("ceborl", "ceborl"),
+    "CEBORL, the paper's form": ("ceborl", "ceborl_paper"),
+    "BC on the same data": ("bc", "bc"),
+}
+RESULT_FIELDS = ("method", "task", "obs_type", "seed", "steps", "episodes", "successes", "low", "high")
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """
+    What a demo does; fixed before it runs.
+
+    :param task: what is to be learned
+    :param obs_type: "state" or "pixels"
+    :param episodes_per_task: attempts at each of the five tasks in the unlabelled dataset
+    :param held_out_episodes: attempts at the task, apart from the dataset, that examples are taken from
+    :param n_examples: success examples
+    :param n_timesteps: gradient steps of each method; ``None`` for the configs'
+    :param n_curve_points: evaluations along each run
+    :param n_curve_episodes: episodes of each
+    :param n_final_episodes: episodes of the final policies
+    :param methods: which of :data:`METHODS`
+    :param seed: of everything
+    """
+
+    task: str = "drawer-open"
+    obs_type: str = "state"
+    episodes_per_task: int = 300
+    held_out_episodes: int = 80
+    n_examples: int = 200
+    n_timesteps: int | None = None
+    n_curve_points: int = 6
+    n_curve_episodes: int = 20
+    n_final_episodes: int = 50
+    methods: tuple[str, ...] = tuple(METHODS)
+    seed: int = 0
+
+
+def run_demo(output: Path, settings: DemoSettings) -> str:
+    """
+    Collect, train, evaluate and report. Data that are complete from an earlier run are used again.
+
+    :param output: folder, created; ``report.md`` in it shows the rest
+    :param settings: what to do
+    :return: the report's text
+    """
+    began = time.monotonic()
+    data = collect(output / "data", settings)
+    env_kwargs = {"task": settings.task, "obs_type": settings.obs_type}
+    suffix = "" if settings.obs_type == "state" else "_pixels"
+    rows = [behaviour_row(data["dataset"], settings)]
+    steps = {}
+    for method in settings.methods:
+        algo, config_name = METHODS[method]
+        config = load_config(config_name + suffix, ENV_ID)
+        if settings.n_timesteps:
+            config["n_timesteps"] = settings.n_timesteps
+        steps[method] = config["n_timesteps"]
+        print(f"Training {method}: {steps[method]} gradient steps")
+        model = train(
+            algo,
+            ENV_ID,
+            config,
+            run_folder(output, method),
+            dataset=str(data["dataset"]),
+            examples=None if algo == "bc" else str(data["examples"]),
+            env_kwargs=env_kwargs,
+            seed=settings.seed,
+            eval_freq=max(steps[method] // settings.n_curve_points, 1),
+            n_eval_episodes=settings.n_curve_episodes,
+        )
+        result = evaluate_success(model, ENV_ID, env_kwargs, settings.n_final_episodes)
+        rows.append(result_row(method, settings, steps[method], settings.n_final_episodes, sum(result.successes)))
+        print(f"{method}: {sum(result.successes)} of {settings.n_final_episodes} episodes solved")
+        if method == "CEBORL":
+            print("Recording the policy and its classifier")
+            assert isinstance(model, CEBORL)
+            record_gif(model, ENV_ID, env_kwargs, output / "policy.gif")
+            judged = judge_trajectories(model, OfflineDataset(data["held_out"]))
+            pair = pick_trajectories(judged)
+            plots.plot_classifier(judged, pair, env_kwargs, output / "classifier.png")
+    plots.plot_curves({method: run_folder(output, method) for method in settings.methods}, output / "learning_curve.png")
+    with (output / "results.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, RESULT_FIELDS)
+        writer.writeheader()
+        writer.writerows(rows)
+    report = write_report(output, settings, rows, time.monotonic() - began)
+    return report
+
+
+def run_folder(output: Path, method: str) -> Path:
+    """:return: where a method's model and evaluations are"""
+    return output / "runs" / METHODS[method][1]
+
+
+def collect(folder: Path, settings: DemoSettings) -> dict[str, Path]:
+    """
+    :param folder: for the files
+    :param settings: how much to collect
+    :return: ``dataset`` (unlabelled for the learners), ``held_out`` and ``examples``
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    # The names say what is in the files, so that other settings do not find the wrong ones.
+    stem = f"{settings.obs_type}-{settings.episodes_per_task}-seed{settings.seed}"
+    held_stem = f"{settings.obs_type}-{settings.task}-{settings.held_out_episodes}-seed{settings.seed + 1}"
+    paths = {
+        "dataset": folder / f"dataset-{stem}.h5",
+        "held_out": folder / f"held-out-{held_stem}.h5",
+        "examples": folder / f"examples-{held_stem}-{settings.n_examples}.h5",
+    }
+    print(f"Collecting {len(TASKS) * settings.episodes_per_task} episodes: {BEHAVIOUR}")
+    _collect_once(paths["dataset"], settings.episodes_per_task, TASKS, settings.obs_type, settings.seed)
+    print(f"Collecting {settings.held_out_episodes} more of {settings.task}, for its success examples")
+    _collect_once(paths["held_out"], settings.held_out_episodes, (settings.task,), settings.obs_type, settings.seed + 1)
+    examples, provenance = extract_examples(paths["held_out"], settings.n_examples, seed=settings.seed, held_out=True)
+    save_examples(paths["examples"], examples, OfflineDataset(paths["held_out"]).observation_space, provenance)
+    return paths
+
+
+def _collect_once(path: Path, episodes_per_task: int, tasks: tuple[str, ...], obs_type: str, seed: int) -> None:
+    if not path.exists() or OfflineDataset(path).n_episodes < episodes_per_task * len(tasks):
+        collect_scripted(path, episodes_per_task=episodes_per_task, tasks=tasks, obs_type=obs_type, seed=seed, mode="w")
+
+
+def behaviour_row(dataset: Path, settings: DemoSettings) -> dict[str, Any]:
+    """
+    :param dataset: what the learners see
+    :param settings: which task
+    :return: how often all that was collected solves the task: what a perfect imitation of it would reach
+    """
+    data = OfflineDataset(dataset)
+    solved = np.logical_or.reduceat(data.extras["task_success"][:, TASKS.index(settings.task)], data.step_starts)
+    return result_row("the behaviour itself", settings, 0, data.n_episodes, int(solved.sum()))
+
+
+def result_row(method: str, settings: DemoSettings, steps: int, episodes: int, successes: int) -> dict[str, Any]:
+    """:return: values of :data:`RESULT_FIELDS`"""
+    low, high = success_interval(successes, episodes)
+    values = (
+        method,
+        settings.task,
+        settings.obs_type,
+        settings.seed,
+        steps,
+        episodes,
+        successes,
+        round(low, 3),
+        round(high, 3),
+    )
+    return dict(zip(RESULT_FIELDS, values, strict=True))
+
+
+def result_table(rows: list[dict[str, Any]]) -> str:
+    """
+    :param rows: of ``results.csv``
+    :return: a Markdown table
+    """
+    lines = ["| method | gradient steps | solved | success rate (95 % interval) |", "|---|---|---|---|"]
+    for row in rows:
+        rate = int(row["successes"]) / int(row["episodes"])
+        interval = f"{rate:.2f} ({float(row['low']):.2f} to {float(row['high']):.2f})"
+        lines.append(f"| {row['method']} | {row['steps']} | {row['successes']} of {row['episodes']} | {interval} |")
+    return "\n".join(lines)
+
+
+def write_report(output: Path, settings: DemoSettings, rows: list[dict[str, Any]], seconds: float) -> str:
+    """
+    :param output: the demo's folder
+    :param settings: what was done
+    :param rows: of the table
+    :param seconds: wall time
+    :return: the text of ``report.md``
+    """
+    machine = f"{th.get_num_threads()} threads, PyTorch {th.__version__}, Python {platform.python_version()}"
+    report = f"""# {settings.task} from {settings.n_examples} examples of success
+
+{result_table(rows)}
+
+Success: the task was solved at any decision of an episode. Seed {settings.seed}; the last policy of each run, no checkpoint
+was chosen. The data: {BEHAVIOUR}; {settings.episodes_per_task} episodes of each of five tasks, no rewards, no task labels.
+
+![The policy](policy.gif)
+
+![Learning curves](learning_curve.png)
+
+![The classifier along a successful and a failed trajectory](classifier.png)
+
+Took {seconds / 60:.1f} minutes ({machine}; sb3-offline {sb3_offline.__version__}).
+Settings: `{json.dumps(asdict(settings))}`
+"""
+    (output / "report.md").write_text(report)
+    return report

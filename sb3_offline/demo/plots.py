@@ -1,0 +1,81 @@
+"""The demo's pictures."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib
+import numpy as np
+
+from sb3_offline.data_tools.collect_scripted import ENV_ID
+from sb3_offline.demo.trajectories import JudgedTrajectories
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+COLORS = {True: "#1b7f4b", False: "#b3402e"}
+N_PICTURES = 6
+
+
+def plot_curves(runs: dict[str, Path], path: Path) -> None:
+    """
+    :param runs: label to the folder of a run
+    :param path: of the PNG
+    """
+    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for (label, folder), style in zip(runs.items(), ("-o", "--s", ":^"), strict=False):
+        with (folder / "evaluations.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        rates = [int(row["successes"]) / int(row["episodes"]) for row in rows]
+        axes.plot([int(row["step"]) for row in rows], rates, style, label=label, markersize=4)
+    episodes = rows[0]["episodes"] if rows else 0
+    axes.set(xlabel="gradient steps", ylabel=f"success rate ({episodes} episodes)", ylim=(-0.03, 1.03), xlim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], env_kwargs: dict[str, Any], path: Path) -> None:
+    """
+    The odds along a successful and a failed attempt, in front of the spread of all of their kind, over pictures of both.
+
+    :param judged: trajectories
+    :param pair: indices of the successful and the failed one
+    :param env_kwargs: of the environment that draws them
+    :param path: of the PNG
+    """
+    n_decisions = judged.odds.shape[1]
+    pictured = np.linspace(0, n_decisions - 1, N_PICTURES).round().astype(int)
+    figure = plt.figure(figsize=(8, 6.4), layout="constrained")
+    grid = figure.add_gridspec(3, N_PICTURES, height_ratios=[2.4, 1, 1])
+    axes = figure.add_subplot(grid[0, :])
+    for index, solved in zip(pair, (True, False), strict=True):
+        color, word = COLORS[solved], "successful" if solved else "failed"
+        alike = judged.odds[judged.solved == solved]
+        low, high = np.quantile(alike, (0.25, 0.75), axis=0)
+        axes.fill_between(range(n_decisions), low, high, color=color, alpha=0.18, lw=0)
+        axes.plot(judged.odds[index], color=color, label=f"{word} (band: middle half of all {len(alike)})")
+        if solved:
+            first = int(np.argmax(judged.success[index]))
+            axes.axvline(first, color=color, ls=":", lw=1)
+            axes.annotate(
+                "solved", (first, 1), (4, -12), xycoords=("data", "axes fraction"), textcoords="offset points", color=color
+            )
+    axes.set(yscale="log", xlabel="decision", ylabel="odds C / (1 - C)", xlim=(0, n_decisions - 1))
+    axes.set_title("The classifier along held-out attempts at the task", fontsize=10)
+    axes.legend(frameon=False, fontsize=9)
+    env: Any = gym.make(ENV_ID, **{**env_kwargs, "obs_type": "state"}).unwrapped
+    for row, (index, solved) in enumerate(zip(pair, (True, False), strict=True), start=1):
+        env.reset(seed=int(judged.seeds[index]))
+        for column, decision in enumerate(pictured):
+            env.scene.set_state(judged.scene_state[index, decision])
+            cell = figure.add_subplot(grid[row, column])
+            cell.imshow(env.get_picture(200, 200))
+            cell.set(xticks=[], yticks=[])
+            cell.set_title(f"decision {decision}", fontsize=8, color=COLORS[solved])
+            cell.spines[:].set_color(COLORS[solved])
+    env.close()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,60 @@
+"""What a trained classifier says along recorded trajectories."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch as th
+
+from sb3_offline.ceborl import CEBORL
+from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.reader import OfflineDataset
+
+
+@dataclass(frozen=True)
+class JudgedTrajectories:
+    """
+    :param odds: ``(episodes, decisions)``, C / (1 - C) of each recorded state and action, the smaller of the critics
+    :param success: ``(episodes, decisions)`` bool, after each decision
+    :param scene_state: ``(episodes, decisions, 30)``, to draw the scene after each decision
+    :param seeds: ``(episodes,)``, to draw the scene before the first
+    """
+
+    odds: np.ndarray
+    success: np.ndarray
+    scene_state: np.ndarray
+    seeds: np.ndarray
+
+    @property
+    def solved(self) -> np.ndarray:
+        return np.asarray(self.success.any(axis=1))
+
+
+@th.no_grad()
+def judge_trajectories(model: CEBORL, dataset: OfflineDataset) -> JudgedTrajectories:
+    """
+    :param model: gives the classifier
+    :param dataset: episodes of equal length, with the extra ``scene_state``
+    :return: its odds at every decision
+    """
+    buffer = OfflineReplayBuffer(dataset, model.observation_space, model.action_space, device=model.device)
+    batches = []
+    for steps in np.array_split(np.arange(buffer.size()), max(buffer.size() // 512, 1)):
+        samples = buffer._get_samples(steps)
+        logits = model.critic.values(model.critic.encode(samples.observations), samples.actions)
+        batches.append(logits.amin(dim=0).exp().cpu().numpy())
+    shape = (dataset.n_episodes, int(dataset.lengths[0]))
+    assert dataset.success is not None and dataset.seeds is not None
+    return JudgedTrajectories(
+        np.concatenate(batches).reshape(shape),
+        np.asarray(dataset.success).reshape(shape),
+        np.asarray(dataset.extras["scene_state"]).reshape(*shape, -1),
+        np.asarray(dataset.seeds),
+    )
+
+
+def pick_trajectories(judged: JudgedTrajectories) -> tuple[int, int]:
+    """
+    :param judged: all trajectories
+    :return: the first that succeeds and the first that fails
+    """
+    return int(np.argmax(judged.solved)), int(np.argmin(judged.solved))
