@@ -161,6 +161,12 @@ def _prepare_worker() -> None:
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 
+def _check_tasks(tasks: Sequence[str]) -> None:
+    unknown = set(tasks) - set(TASKS)
+    if unknown:
+        raise ValueError(f"Unknown tasks {sorted(unknown)}; choose from {', '.join(TASKS)}.")
+
+
 def scripted_episodes(
     episodes_per_task: int,
     *,
@@ -179,9 +185,7 @@ def scripted_episodes(
     :param n_workers: processes; 1 collects in this one
     :return: `episodes_per_task * len(tasks)` episodes
     """
-    unknown = set(tasks) - set(TASKS)
-    if unknown:
-        raise ValueError(f"Unknown tasks {sorted(unknown)}; choose from {', '.join(TASKS)}.")
+    _check_tasks(tasks)
     seeds = np.random.SeedSequence(seed).generate_state(episodes_per_task * len(tasks))
     jobs = [(tasks[i % len(tasks)], int(episode_seed)) for i, episode_seed in enumerate(seeds)]
     run = functools.partial(_episode_in_worker, obs_type)
@@ -223,6 +227,7 @@ def collect_scripted(
     :param mode: "x" refuses an existing file, "w" replaces it
     :return: for each task the share of its episodes that succeeded at some step
     """
+    _check_tasks(tasks)
     env = _shared_env(obs_type)
     n_episodes = episodes_per_task * len(tasks)
     n_steps = n_episodes * env.unwrapped.episode_length  # type: ignore[attr-defined]

@@ -13,11 +13,9 @@ def main(argv: list[str] | None = None) -> None:
     """:param argv: the command line, default ``sys.argv``"""
     parser = _parser()
     arguments = parser.parse_args(argv)
-    from sb3_offline.data.errors import DatasetError
-
     try:
         arguments.run(arguments)
-    except (DatasetError, RuntimeError, FileExistsError) as error:
+    except (RuntimeError, ValueError, FileExistsError) as error:
         sys.exit(f"sb3-offline: {error}")
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])

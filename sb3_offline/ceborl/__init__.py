@@ -1,4 +1,4 @@
-from sb3_offline.ceborl.ceborl import CEBORL
+from sb3_offline.ceborl.ceborl import CEBORL, PAPER_FORM
 from sb3_offline.ceborl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
-__all__ = ["CEBORL", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]
+__all__ = ["CEBORL", "PAPER_FORM", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]

@@ -109,7 +109,8 @@ class OfflineDataset:
         if isinstance(self.observation_space, spaces.Dict):
             self.observations = {key: arrays[f"observations/{key}"] for key in self.observation_space}
         self.actions, self.rewards = arrays["actions"], arrays.get("rewards")
-        self.terminated, self.truncated, self.success = (arrays.get(k) for k in ("terminated", "truncated", "success"))
+        self.terminated, self.truncated = arrays["terminated"], arrays["truncated"]
+        self.success = arrays.get("success")
         self.extras = {name: arrays[f"extras/{name}"] for name in header.extras}
         self.arrays = arrays
         self._check(arrays)

@@ -21,8 +21,9 @@ from sb3_offline.demo import plots
 from sb3_offline.demo.trajectories import judge_trajectories, pick_trajectories
 from sb3_offline.experiment.config import load_config
 from sb3_offline.experiment.evaluation import evaluate_success, success_interval
+from sb3_offline.experiment.parallel import train_in_parallel
 from sb3_offline.experiment.recording import record_gif
-from sb3_offline.experiment.training import train
+from sb3_offline.experiment.training import load_run
 
 #: Rows of the table: label, algorithm, config.
 METHODS = {
@@ -49,6 +50,7 @@ class DemoSettings:
     :param n_final_episodes: episodes of the final policies
     :param methods: which of :data:`METHODS`
     :param seed: of everything
+    :param n_workers: processes, one thread each
     """
 
     task: str = "drawer-open"
@@ -62,6 +64,7 @@ class DemoSettings:
     n_final_episodes: int = 50
     methods: tuple[str, ...] = tuple(METHODS)
     seed: int = 0
+    n_workers: int = 2
 
 
 def run_demo(output: Path, settings: DemoSettings) -> str:
@@ -74,40 +77,24 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
     """
     began = time.monotonic()
     data = collect(output / "data", settings)
+    runs = {method: training_run(method, output, data, settings) for method in settings.methods}
+    print(f"Training {', '.join(runs)}")
+    train_in_parallel(runs, settings.n_workers)
+
     env_kwargs = {"task": settings.task, "obs_type": settings.obs_type}
-    suffix = "" if settings.obs_type == "state" else "_pixels"
     rows = [behaviour_row(data["dataset"], settings)]
-    steps = {}
-    for method in settings.methods:
-        algo, config_name = METHODS[method]
-        config = load_config(config_name + suffix, ENV_ID)
-        if settings.n_timesteps:
-            config["n_timesteps"] = settings.n_timesteps
-        steps[method] = config["n_timesteps"]
-        print(f"Training {method}: {steps[method]} gradient steps")
-        model = train(
-            algo,
-            ENV_ID,
-            config,
-            run_folder(output, method),
-            dataset=str(data["dataset"]),
-            examples=None if algo == "bc" else str(data["examples"]),
-            env_kwargs=env_kwargs,
-            seed=settings.seed,
-            eval_freq=max(steps[method] // settings.n_curve_points, 1),
-            n_eval_episodes=settings.n_curve_episodes,
-        )
+    for method, run in runs.items():
+        model, config = load_run(run["output"] / "model.zip")
+        print(f"Playing {settings.n_final_episodes} episodes of {method}")
         result = evaluate_success(model, ENV_ID, env_kwargs, settings.n_final_episodes)
-        rows.append(result_row(method, settings, steps[method], settings.n_final_episodes, sum(result.successes)))
-        print(f"{method}: {sum(result.successes)} of {settings.n_final_episodes} episodes solved")
+        rows.append(result_row(method, settings, config["n_timesteps"], settings.n_final_episodes, sum(result.successes)))
         if method == "CEBORL":
             print("Recording the policy and its classifier")
             assert isinstance(model, CEBORL)
             record_gif(model, ENV_ID, env_kwargs, output / "policy.gif")
             judged = judge_trajectories(model, OfflineDataset(data["held_out"]))
-            pair = pick_trajectories(judged)
-            plots.plot_classifier(judged, pair, env_kwargs, output / "classifier.png")
-    plots.plot_curves({method: run_folder(output, method) for method in settings.methods}, output / "learning_curve.png")
+            plots.plot_classifier(judged, pick_trajectories(judged), output / "classifier.png")
+    plots.plot_curves({method: run["output"] for method, run in runs.items()}, output / "learning_curve.png")
     with (output / "results.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, RESULT_FIELDS)
         writer.writeheader()
@@ -116,9 +103,30 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
     return report
 
 
-def run_folder(output: Path, method: str) -> Path:
-    """:return: where a method's model and evaluations are"""
-    return output / "runs" / METHODS[method][1]
+def training_run(method: str, output: Path, data: dict[str, Path], settings: DemoSettings) -> dict[str, Any]:
+    """
+    :param method: of :data:`METHODS`
+    :param output: the demo's folder
+    :param data: what :func:`collect` returned
+    :param settings: what to do
+    :return: arguments of :func:`~sb3_offline.experiment.training.train`
+    """
+    algo, config_name = METHODS[method]
+    config = load_config(config_name + ("_pixels" if settings.obs_type == "pixels" else ""), ENV_ID)
+    if settings.n_timesteps:
+        config["n_timesteps"] = settings.n_timesteps
+    return {
+        "algo": algo,
+        "env_id": ENV_ID,
+        "config": config,
+        "output": output / "runs" / config_name,
+        "dataset": str(data["dataset"]),
+        "examples": None if algo == "bc" else str(data["examples"]),
+        "env_kwargs": {"task": settings.task},
+        "seed": settings.seed,
+        "eval_freq": max(config["n_timesteps"] // settings.n_curve_points, 1),
+        "n_eval_episodes": settings.n_curve_episodes,
+    }
 
 
 def collect(folder: Path, settings: DemoSettings) -> dict[str, Path]:
@@ -199,7 +207,7 @@ def write_report(output: Path, settings: DemoSettings, rows: list[dict[str, Any]
     :param seconds: wall time
     :return: the text of ``report.md``
     """
-    machine = f"{th.get_num_threads()} threads, PyTorch {th.__version__}, Python {platform.python_version()}"
+    machine = f"{settings.n_workers} processes, PyTorch {th.__version__}, Python {platform.python_version()}"
     report = f"""# {settings.task} from {settings.n_examples} examples of success
 
 {result_table(rows)}

@@ -37,13 +37,12 @@ def plot_curves(runs: dict[str, Path], path: Path) -> None:
     plt.close(figure)
 
 
-def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], env_kwargs: dict[str, Any], path: Path) -> None:
+def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Path) -> None:
     """
     The odds along a successful and a failed attempt, in front of the spread of all of their kind, over pictures of both.
 
     :param judged: trajectories
     :param pair: indices of the successful and the failed one
-    :param env_kwargs: of the environment that draws them
     :param path: of the PNG
     """
     n_decisions = judged.odds.shape[1]
@@ -66,7 +65,7 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], env_kwarg
     axes.set(yscale="log", xlabel="decision", ylabel="odds C / (1 - C)", xlim=(0, n_decisions - 1))
     axes.set_title("The classifier along held-out attempts at the task", fontsize=10)
     axes.legend(frameon=False, fontsize=9)
-    env: Any = gym.make(ENV_ID, **{**env_kwargs, "obs_type": "state"}).unwrapped
+    env: Any = gym.make(ENV_ID, obs_type="state").unwrapped
     for row, (index, solved) in enumerate(zip(pair, (True, False), strict=True), start=1):
         env.reset(seed=int(judged.seeds[index]))
         for column, decision in enumerate(pictured):

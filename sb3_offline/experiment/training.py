@@ -97,6 +97,7 @@ def train(
     eval_freq: int = 0,
     n_eval_episodes: int = 20,
     progress_bar: bool = True,
+    callback: BaseCallback | None = None,
     verbose: int = 0,
 ) -> OfflineAlgorithm:
     """
@@ -113,6 +114,7 @@ def train(
     :param eval_freq: gradient steps between evaluations (0: none)
     :param n_eval_episodes: episodes of each evaluation
     :param progress_bar: whether to show one
+    :param callback: one more callback
     :param verbose: 1 for info messages
     :return: the trained model
     """
@@ -125,10 +127,11 @@ def train(
     if isinstance(examples, (str, Path)):
         record["examples"] = str(examples)
     (output / "config.yml").write_text(yaml.safe_dump(json.loads(json.dumps(record)), sort_keys=False))
-    callback = None
+    callbacks = [callback] if callback is not None else []
     if eval_freq:
-        callback = EvaluationTable(output / "evaluations.csv", env_id, all_env_kwargs, eval_freq, n_eval_episodes, verbose)
-    model.learn(config["n_timesteps"], callback=callback, progress_bar=progress_bar)
+        table = output / "evaluations.csv"
+        callbacks.append(EvaluationTable(table, env_id, all_env_kwargs, eval_freq, n_eval_episodes, verbose))
+    model.learn(config["n_timesteps"], callback=callbacks, progress_bar=progress_bar)
     model.save(output / "model.zip")
     return model
 

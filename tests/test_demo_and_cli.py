@@ -1,0 +1,111 @@
+"""The command line on real, small data: what the README promises, in seconds instead of minutes."""
+
+import csv
+
+import pytest
+from PIL import Image
+
+from sb3_offline import cli
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.demo.pipeline import METHODS, DemoSettings, run_demo
+from sb3_offline.experiment.config import load_config, parse_overrides
+from sb3_offline.experiment.evaluation import success_interval
+
+TINY = DemoSettings(
+    episodes_per_task=6,
+    held_out_episodes=12,
+    n_examples=20,
+    n_timesteps=4,
+    n_curve_points=2,
+    n_curve_episodes=1,
+    n_final_episodes=2,
+)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    return folder, run_demo(folder, TINY)
+
+
+def test_demo_leaves_all_it_promises(demo):
+    folder, report = demo
+    with (folder / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == ["the behaviour itself", *METHODS]
+    assert [int(row["episodes"]) for row in rows] == [30, 2, 2, 2]
+    assert all(method in report for method in METHODS)
+    with Image.open(folder / "policy.gif") as gif:
+        assert gif.n_frames > 30 and gif.size == (240, 240)
+    for name in ("learning_curve.png", "classifier.png"):
+        with Image.open(folder / name) as picture:
+            assert picture.width > 500
+    assert sum(1 for _ in (folder / "runs/ceborl/evaluations.csv").open()) == 3
+
+
+def test_demo_uses_complete_data_again(demo):
+    folder, _ = demo
+    dataset = next((folder / "data").glob("dataset-*.h5"))
+    before = dataset.stat().st_mtime_ns
+    from sb3_offline.demo.pipeline import collect
+
+    collect(folder / "data", TINY)
+    assert dataset.stat().st_mtime_ns == before and OfflineDataset(dataset).n_episodes == 30
+
+
+def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
+    folder, _ = demo
+    held_out = str(next((folder / "data").glob("held-out-*.h5")))
+    cli.main(["inspect", held_out])
+    assert "drawer-open" in capsys.readouterr().out
+    cli.main(["convert", held_out, str(tmp_path / "small.h5"), "--storage", "compressed"])
+    cli.main(["examples", str(tmp_path / "small.h5"), "-n", "10", "-o", str(tmp_path / "examples.h5")])
+    run = str(tmp_path / "run")
+    train = ["train", "--dataset", held_out, "--examples", str(tmp_path / "examples.h5"), "--task", "drawer-open", "-n", "2"]
+    cli.main([*train, "--hyperparams", "beta:0.05", "n_action_samples:2", "-o", run])
+    assert "beta: 0.05" in (tmp_path / "run/config.yml").read_text()
+    capsys.readouterr()
+    cli.main(["evaluate", f"{run}/model.zip", "--episodes", "1"])
+    assert "of 1 episodes solved" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["inspect", "nowhere.h5"], "nowhere.h5"),
+        (["evaluate", "nowhere/model.zip"], r"nowhere/model\.zip: there is no such file"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--config", "nothing"], "no such config file.*ceborl_paper"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--hyperparams", "beta"], "key:value"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--algo", "dqn", "--config", "bc"], "no algorithm 'dqn'.*ceborl"),
+        (["collect", "out.h5", "--tasks", "door-shut"], "door-shut"),
+    ],
+)
+def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=f"(?s)sb3-offline: .*{message}"):
+        cli.main(arguments)
+    assert not list(tmp_path.glob("**/*.h5"))
+
+
+def test_shipped_configs_are_read_and_overwritten():
+    assert load_config("ceborl", "MultimodalMetaworld-v0")["policy"] == "MlpPolicy"
+    assert load_config("ceborl_pixels", "MultimodalMetaworld-v0")["env_kwargs"]["obs_type"] == "pixels"
+    assert parse_overrides(["tau:0.01", "mu:policy", "policy_kwargs:{'net_arch': [8]}"]) == {
+        "tau": 0.01,
+        "mu": "policy",
+        "policy_kwargs": {"net_arch": [8]},
+    }
+
+
+def test_paper_preset_and_paper_config_are_the_same():
+    from sb3_offline.ceborl import PAPER_FORM
+
+    for name in ("ceborl_paper", "ceborl_paper_pixels"):
+        config = load_config(name, "MultimodalMetaworld-v0")
+        assert {key: config[key] for key in PAPER_FORM} == PAPER_FORM
+
+
+def test_success_interval_is_wilsons():
+    low, high = success_interval(8, 10)
+    assert (low, high) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
+    assert success_interval(0, 20)[0] == 0.0 and 0.15 < success_interval(0, 20)[1] < 0.17
