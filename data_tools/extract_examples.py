@@ -24,7 +24,7 @@ def extract_examples(
     :param source: take episodes of this source only, e.g. "door-open" in a file of several tasks
     :param seed: seed of the draw
     :param held_out: recorded: whether these episodes are kept out of the data that will be learned from
-    :return: (n, *shape) observations, or a dict of such for a Dict space, in the dataset's layout; and their provenance
+    :return: ``(n, *shape)`` observations, or a dict of such for a Dict space, in the dataset's layout; and their provenance
     """
     datasets = open_datasets(dataset)
     steps_of = [_success_steps(part, source) for part in datasets]

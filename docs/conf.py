@@ -1,8 +1,5 @@
 """Configuration of the documentation. Build it with: python -m sphinx -W -b html docs docs/_build"""
 
-import re
-from typing import Any
-
 import sb3_offline
 
 project = "sb3-offline"
@@ -36,14 +33,3 @@ html_theme_options = {
     "fixed_sidebar": True,
 }
 html_show_copyright = False
-
-
-def _escape_stars(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings write shapes as (n, *shape). Outside of literals, reStructuredText would take the star for emphasis."""
-    literal_or_star = re.compile(r"``.*?``|\*(?=\w+[),])")
-    lines[:] = [literal_or_star.sub(lambda found: r"\*" if found[0] == "*" else found[0], line) for line in lines]
-
-
-def setup(app: Any) -> None:
-    """:param app: Sphinx"""
-    app.connect("autodoc-process-docstring", _escape_stars)

@@ -70,6 +70,8 @@ def _collect(parser: argparse.ArgumentParser) -> Callable:
     def run(args: argparse.Namespace) -> None:
         from sb3_offline.data_tools.collect_scripted import TASKS, collect_scripted
 
+        if Path(args.output).exists() and not args.overwrite:
+            sys.exit(f"sb3-offline: {args.output} exists already; name another file, or add --overwrite")
         shares = collect_scripted(
             args.output,
             episodes_per_task=args.episodes_per_task,
@@ -101,7 +103,9 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
 
     def run(args: argparse.Namespace) -> None:
         from sb3_offline.experiment.config import load_config, parse_overrides
-        from sb3_offline.experiment.training import train
+        from sb3_offline.experiment.training import find_algorithm, train
+
+        find_algorithm(args.algo)  # before its config is looked for
 
         config = {**load_config(args.config or args.algo, args.env), **parse_overrides(args.hyperparams)}
         if args.n_timesteps:

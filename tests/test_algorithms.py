@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_offline import ALGOS, RCE
 from sb3_offline.common.torch_layers import StandardizedExtractor
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.writer import DatasetWriter
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -164,6 +165,26 @@ def test_vectors_are_standardised_by_the_dataset_and_stay_so_after_loading(files
     assert th.equal(encoder.mean, model.critic_target.features_extractor.mean)
     model.save(tmp_path / "model")
     assert th.equal(ALGOS["ceborl"].load(tmp_path / "model").actor.features_extractor.mean, encoder.mean)
+
+
+def test_the_users_policy_kwargs_stay_as_they_are(files):
+    dataset, examples = files["MlpPolicy"]
+    policy_kwargs = {"net_arch": [8]}
+    ALGOS["ceborl"]("MlpPolicy", None, dataset, examples, policy_kwargs=policy_kwargs)
+    rce = ALGOS["rce"]("MlpPolicy", None, dataset, examples, policy_kwargs=policy_kwargs)
+    assert policy_kwargs == {"net_arch": [8]}
+    assert rce.critic.q_networks[0][-1].bias.item() == 0.0  # odds of 1, not CEBORL's
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.MultiDiscrete([3, 4])])
+def test_one_hot_observations_are_not_standardised(space, tmp_path):
+    with DatasetWriter(tmp_path / "d.h5", space, ACTIONS, rewards=False, success=False) as writer:
+        space.seed(0)
+        writer.add_episode(np.stack([space.sample() for _ in range(9)]), np.stack([ACTIONS.sample() for _ in range(8)]))
+    examples = np.stack([space.sample() for _ in range(4)])
+    model = ALGOS["ceborl"]("MlpPolicy", None, tmp_path / "d.h5", examples, n_action_samples=2).learn(2)
+    assert not model.actor.features_extractor.fitted
+    assert model.predict(space.sample())[0].shape == ACTIONS.shape
 
 
 def test_vec_normalize_is_fitted_to_the_dataset(files):

@@ -326,6 +326,7 @@ class CEBORL(ExampleBasedAlgorithm):
             classifier_policy=self.critic.values(features, actions).amin(dim=0).sigmoid().mean(),
             omega_p50=p50,
             omega_p99=p99,
+            # Half of the bound: one of the two horizons is at it.
             omega_clipped=(omega >= 0.5 * self.omega_max).float().mean(),
         )
 

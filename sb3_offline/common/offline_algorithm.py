@@ -89,7 +89,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             tau=tau,
             gamma=gamma,
             n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),  # algorithms add their defaults to it
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,

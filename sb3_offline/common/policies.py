@@ -296,7 +296,12 @@ class OfflinePolicy(SACPolicy):
         :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for dict
             observations; called only where a policy standardises
         """
-        encoders = {module: "" for module in self.modules() if isinstance(module, StandardizedExtractor)}
+        encoders = {
+            module: ""
+            for module in self.modules()
+            # One-hot vectors (of Discrete spaces) stay as they are.
+            if isinstance(module, StandardizedExtractor) and isinstance(module._observation_space, spaces.Box)
+        }
         for module in self.modules():
             if isinstance(module, StandardizedCombinedExtractor):
                 encoders.update({part: key for key, part in module.extractors.items() if part in encoders})

@@ -24,7 +24,7 @@ class OfflineSamples(NamedTuple):
     """
     A batch of B transitions; the first six fields are those of SB3's ``ReplayBufferSamples``, for one step.
 
-    :param observations: (B, *shape), channel-first images as a channels-last view of uint8
+    :param observations: ``(B, *shape)``, channel-first images as a channels-last view of uint8
     :param actions: (B, A) scaled to [-1, 1]
     :param next_observations: as ``observations``
     :param dones: (B, 1) float, 1 where the step terminated; never where it was only truncated

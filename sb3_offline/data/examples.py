@@ -33,8 +33,8 @@ def load_examples(
         each key); a ``.npy``; an array, or a dict of arrays; or a folder of PNG or JPEG pictures, taken in the order of their
         names and resized (the whole picture, so crop it before where its proportions differ)
     :param observation_space: a Box, or a Dict; images may be channel-last or channel-first, here and in the source
-    :return: (n, *shape) of the space's dtype, or a dict of such; raises ``DatasetError`` where there is none, or where shape,
-        dtype or range do not fit the space
+    :return: ``(n, *shape)`` of the space's dtype, or a dict of such; raises ``DatasetError`` where there is none, or where
+        shape, dtype or range do not fit the space
     """
     value: Any = source
     file: str | os.PathLike = ""
@@ -76,7 +76,7 @@ def save_examples(
     Write success examples to an HDF5 file, replacing an older one whole.
 
     :param path: the file
-    :param observations: (n, *shape), or a dict of such for a Dict space
+    :param observations: ``(n, *shape)``, or a dict of such for a Dict space
     :param observation_space: space of one observation
     :param provenance: where they come from (JSON)
     """

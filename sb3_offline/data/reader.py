@@ -64,9 +64,9 @@ class OfflineDataset:
     - ``observation_space``, ``action_space``, ``env_id``, ``env_kwargs``, ``provenance``, ``sources`` (labels)
     - ``n_episodes`` (E), ``n_steps`` (N), ``lengths``, ``step_starts``, ``observation_starts``, ``seeds`` (E,) int64,
       ``source`` (E,) int16 or ``None``: index into ``sources``
-    - ``observations`` (N + E, *shape), a dict of such for a Dict space: a read-only memory map in contiguous storage,
+    - ``observations`` ``(N + E, *shape)``, a dict of such for a Dict space: a read-only memory map in contiguous storage,
       an ``HDF5Array`` in compressed storage. ``extras``: likewise, (N, ...) by name
-    - ``actions`` (N, *shape) float32 in environment units, ``rewards`` (N,) float32 or ``None``, ``terminated``,
+    - ``actions`` ``(N, *shape)`` float32 in environment units, ``rewards`` (N,) float32 or ``None``, ``terminated``,
       ``truncated`` (N,) bool, ``success`` (N,) bool or ``None``
     - ``storage``: "contiguous", "compressed", or "memory" (D4RL)
 

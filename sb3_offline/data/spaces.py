@@ -118,13 +118,13 @@ def check_rows(
     """
     Check rows of one array, and convert them to its dtype where that changes no value by more than rounding.
 
-    :param value: array-like of shape (rows, *shape)
+    :param value: array-like of shape ``(rows, *shape)``
     :param shape: shape of one row
     :param dtype: dtype of the result
     :param rows: expected number of rows, ``None`` for any
     :param file: for the error message
     :param field: for the error message
-    :return: array of shape (rows, *shape); raises ``DatasetError`` on another shape or dtype, values outside of the
+    :return: array of shape ``(rows, *shape)``; raises ``DatasetError`` on another shape or dtype, values outside of the
         dtype's range, NaN or infinity
     """
     array = np.asarray(value)

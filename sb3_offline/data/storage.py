@@ -30,7 +30,7 @@ class RowStore:
     def take(self, rows: np.ndarray) -> np.ndarray:
         """
         :param rows: (B,) row numbers
-        :return: (B, *shape) a copy of these rows
+        :return: ``(B, *shape)`` a copy of these rows
         """
         if len(self.parts) == 1:
             return self.parts[0].take(rows, axis=0)

@@ -102,8 +102,8 @@ class DatasetWriter:
         Write one episode of T steps. When this returns, the episode is in the file, whatever happens to the process.
         Nothing is written unless all of it is valid (``DatasetError`` otherwise).
 
-        :param observations: (T + 1, *shape), or a dict of such for a Dict space: the last observation too
-        :param actions: (T, *shape) in the environment's units
+        :param observations: ``(T + 1, *shape)``, or a dict of such for a Dict space: the last observation too
+        :param actions: ``(T, *shape)`` in the environment's units
         :param rewards: (T,) float; required if the file has rewards
         :param terminated: (T,) bool, true at most in the last step; default: never
         :param truncated: (T,) bool, true at most in the last step; default: in the last step, if that did not terminate

@@ -58,6 +58,16 @@ def evaluation_row(step: int, result: Evaluation) -> tuple[int, int, int, float]
     return step, len(result.successes), sum(result.successes), round(mean_return, 3)
 
 
+def find_algorithm(name: str) -> type[OfflineAlgorithm]:
+    """
+    :param name: in :data:`sb3_offline.ALGOS`
+    :return: the class
+    """
+    if name not in sb3_offline.ALGOS:
+        raise RuntimeError(f"There is no algorithm {name!r}; choose one of {', '.join(sb3_offline.ALGOS)}")
+    return sb3_offline.ALGOS[name]
+
+
 def create_model(
     algo: str,
     config: dict[str, Any],
@@ -75,13 +85,14 @@ def create_model(
     :param kwargs: further constructor arguments
     :return: a model, not trained
     """
-    if algo not in sb3_offline.ALGOS:
-        raise RuntimeError(f"There is no algorithm {algo!r}; choose one of {', '.join(sb3_offline.ALGOS)}")
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs")}
     arguments.update(dataset=dataset, seed=seed, **kwargs)
     if examples is not None:
         arguments["examples"] = examples
-    return sb3_offline.ALGOS[algo](env=None, **arguments)  # type: ignore[arg-type]
+    try:
+        return find_algorithm(algo)(env=None, **arguments)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise RuntimeError(f"{algo}: {error}; check the config and --hyperparams") from error
 
 
 def train(
@@ -123,10 +134,11 @@ def train(
     output.mkdir(parents=True, exist_ok=True)
     all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
     model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
-    record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, "dataset": str(dataset)}
-    if isinstance(examples, (str, Path)):
-        record["examples"] = str(examples)
-    (output / "config.yml").write_text(yaml.safe_dump(json.loads(json.dumps(record)), sort_keys=False))
+    record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, "dataset": dataset}
+    if examples is not None:
+        record["examples"] = examples
+    # Through JSON: paths and NumPy numbers become what a YAML file can hold.
+    (output / "config.yml").write_text(yaml.safe_dump(json.loads(json.dumps(record, default=str)), sort_keys=False))
     callbacks = [callback] if callback is not None else []
     if eval_freq:
         table = output / "evaluations.csv"
@@ -146,4 +158,4 @@ def load_run(model_path: Path) -> tuple[OfflineAlgorithm, dict[str, Any]]:
         if not file.is_file():
             raise RuntimeError(f"{file}: there is no such file; give the model.zip in the folder of a training run")
     config = yaml.safe_load(config_file.read_text())
-    return sb3_offline.ALGOS[config["algo"]].load(model_path), config
+    return find_algorithm(config["algo"]).load(model_path), config
