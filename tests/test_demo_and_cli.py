@@ -13,7 +13,8 @@ from sb3_offline.experiment.evaluation import success_interval
 
 TINY = DemoSettings(
     episodes_per_task=6,
-    held_out_episodes=12,
+    example_episodes=12,
+    judged_episodes=8,
     n_examples=20,
     n_timesteps=4,
     n_curve_points=2,
@@ -36,7 +37,7 @@ def test_demo_leaves_all_it_promises(demo):
     assert [int(row["episodes"]) for row in rows] == [30, 2, 2, 2]
     assert all(method in report for method in METHODS)
     with Image.open(folder / "policy.gif") as gif:
-        assert gif.n_frames > 30 and gif.size == (240, 240)
+        assert gif.n_frames > 30 and gif.size == (200, 200)
     for name in ("learning_curve.png", "classifier.png"):
         with Image.open(folder / name) as picture:
             assert picture.width > 500
@@ -55,7 +56,7 @@ def test_demo_uses_complete_data_again(demo):
 
 def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     folder, _ = demo
-    held_out = str(next((folder / "data").glob("held-out-*.h5")))
+    held_out = str(next((folder / "data").glob("attempts-*-12-*.h5")))
     cli.main(["inspect", held_out])
     assert "drawer-open" in capsys.readouterr().out
     cli.main(["convert", held_out, str(tmp_path / "small.h5"), "--storage", "compressed"])

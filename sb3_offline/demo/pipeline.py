@@ -42,7 +42,8 @@ class DemoSettings:
     :param task: what is to be learned
     :param obs_type: "state" or "pixels"
     :param episodes_per_task: attempts at each of the five tasks in the unlabelled dataset
-    :param held_out_episodes: attempts at the task, apart from the dataset, that examples are taken from
+    :param example_episodes: attempts at the task, apart from the dataset, that examples are taken from
+    :param judged_episodes: further attempts, which nobody learns from, to look at the classifier with
     :param n_examples: success examples
     :param n_timesteps: gradient steps of each method; ``None`` for the configs'
     :param n_curve_points: evaluations along each run
@@ -56,7 +57,8 @@ class DemoSettings:
     task: str = "drawer-open"
     obs_type: str = "state"
     episodes_per_task: int = 300
-    held_out_episodes: int = 80
+    example_episodes: int = 80
+    judged_episodes: int = 40
     n_examples: int = 200
     n_timesteps: int | None = None
     n_curve_points: int = 6
@@ -92,7 +94,7 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
             print("Recording the policy and its classifier")
             assert isinstance(model, CEBORL)
             record_gif(model, ENV_ID, env_kwargs, output / "policy.gif")
-            judged = judge_trajectories(model, OfflineDataset(data["held_out"]))
+            judged = judge_trajectories(model, OfflineDataset(data["judged"]))
             plots.plot_classifier(judged, pick_trajectories(judged), output / "classifier.png")
     plots.plot_curves({method: run["output"] for method, run in runs.items()}, output / "learning_curve.png")
     with (output / "results.csv").open("w", newline="") as file:
@@ -133,23 +135,27 @@ def collect(folder: Path, settings: DemoSettings) -> dict[str, Path]:
     """
     :param folder: for the files
     :param settings: how much to collect
-    :return: ``dataset`` (unlabelled for the learners), ``held_out`` and ``examples``
+    :return: ``dataset`` (unlabelled for the learners), ``examples``, and ``judged``
     """
     folder.mkdir(parents=True, exist_ok=True)
     # The names say what is in the files, so that other settings do not find the wrong ones.
     stem = f"{settings.obs_type}-{settings.episodes_per_task}-seed{settings.seed}"
-    held_stem = f"{settings.obs_type}-{settings.task}-{settings.held_out_episodes}-seed{settings.seed + 1}"
+    source_stem = f"{settings.obs_type}-{settings.task}-{settings.example_episodes}-seed{settings.seed + 1}"
+    judged_stem = f"{settings.obs_type}-{settings.task}-{settings.judged_episodes}-seed{settings.seed + 2}"
+    source = folder / f"attempts-{source_stem}.h5"
     paths = {
         "dataset": folder / f"dataset-{stem}.h5",
-        "held_out": folder / f"held-out-{held_stem}.h5",
-        "examples": folder / f"examples-{held_stem}-{settings.n_examples}.h5",
+        "examples": folder / f"examples-{source_stem}-{settings.n_examples}.h5",
+        "judged": folder / f"attempts-{judged_stem}.h5",
     }
     print(f"Collecting {len(TASKS) * settings.episodes_per_task} episodes: {BEHAVIOUR}")
     _collect_once(paths["dataset"], settings.episodes_per_task, TASKS, settings.obs_type, settings.seed)
-    print(f"Collecting {settings.held_out_episodes} more of {settings.task}, for its success examples")
-    _collect_once(paths["held_out"], settings.held_out_episodes, (settings.task,), settings.obs_type, settings.seed + 1)
-    examples, provenance = extract_examples(paths["held_out"], settings.n_examples, seed=settings.seed, held_out=True)
-    save_examples(paths["examples"], examples, OfflineDataset(paths["held_out"]).observation_space, provenance)
+    print(f"Collecting attempts at {settings.task}: {settings.example_episodes} for success examples, apart from those")
+    _collect_once(source, settings.example_episodes, (settings.task,), settings.obs_type, settings.seed + 1)
+    print(f"and {settings.judged_episodes} to look at the classifier with")
+    _collect_once(paths["judged"], settings.judged_episodes, (settings.task,), settings.obs_type, settings.seed + 2)
+    examples, provenance = extract_examples(source, settings.n_examples, seed=settings.seed, held_out=True)
+    save_examples(paths["examples"], examples, OfflineDataset(source).observation_space, provenance)
     return paths
 
 

@@ -63,7 +63,7 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Pat
                 "solved", (first, 1), (4, -12), xycoords=("data", "axes fraction"), textcoords="offset points", color=color
             )
     axes.set(yscale="log", xlabel="decision", ylabel="odds C / (1 - C)", xlim=(0, n_decisions - 1))
-    axes.set_title("The classifier along held-out attempts at the task", fontsize=10)
+    axes.set_title("The classifier along attempts that it did not learn from", fontsize=10)
     axes.legend(frameon=False, fontsize=9)
     env: Any = gym.make(ENV_ID, obs_type="state").unwrapped
     for row, (index, solved) in enumerate(zip(pair, (True, False), strict=True), start=1):

@@ -13,7 +13,7 @@ LAST_FRAME_MS = 800
 
 
 def record_episode(
-    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], seed: int, size: int = 240
+    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], seed: int, size: int = 200
 ) -> tuple[list[np.ndarray], bool]:
     """
     :param model: plays its mode
