@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 demo: $(READY)  ## the main job: collect, train CEBORL, evaluate, report into demo/ (about 15 minutes)
 	$(BIN)/sb3-offline demo --output demo
 
-demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (hours)
+demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (about half an hour)
 	$(BIN)/sb3-offline demo --obs-type pixels --output demo-pixels
 
 test: $(READY)  ## all fast tests
