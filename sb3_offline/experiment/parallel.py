@@ -61,8 +61,8 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    for bar in bars.values():
-        bar.update(bar.total - bar.n)
+    for label, bar in bars.items():
+        bar.update(runs[label]["config"]["n_timesteps"] - bar.n)
         bar.close()
 
 
