@@ -3,7 +3,6 @@
 from typing import Any
 
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_offline.common.policies import OfflinePolicy
@@ -48,40 +47,12 @@ MlpPolicy = BCPolicy
 
 
 class CnnPolicy(BCPolicy):
-    """
-    :class:`BCPolicy` for images.
+    """:class:`BCPolicy` for images."""
 
-    :param kwargs: see :class:`BCPolicy`
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NormalizedNatureCNN,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor_class = NormalizedNatureCNN
 
 
 class MultiInputPolicy(BCPolicy):
-    """
-    :class:`BCPolicy` for dict observations.
+    """:class:`BCPolicy` for dict observations."""
 
-    :param kwargs: see :class:`BCPolicy`
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedCombinedExtractor,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor_class = StandardizedCombinedExtractor

@@ -8,7 +8,7 @@ have a head for the value of a state without an action.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -216,11 +216,12 @@ class OfflinePolicy(SACPolicy):
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
     :param critic_output_bias: what the critics put out at first, everywhere
     :param critic_state_value: add a critic of states alone
-    :param features_extractor_class: encoder of the observations
+    :param features_extractor_class: encoder of the observations (default: that of the class)
     :param kwargs: all other arguments of :class:`stable_baselines3.sac.policies.SACPolicy`: ``net_arch``, ``activation_fn``,
         ``features_extractor_class``, ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
     """
 
+    default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = StandardizedExtractor
     actor: OfflineActor
     critic: OfflineCritic
     critic_target: OfflineCritic
@@ -235,7 +236,7 @@ class OfflinePolicy(SACPolicy):
         critic_layer_norm: bool = False,
         critic_output_bias: float = 0.0,
         critic_state_value: bool = False,
-        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ):
         self.std_min = std_min
@@ -249,7 +250,7 @@ class OfflinePolicy(SACPolicy):
             action_space,
             lr_schedule,
             share_features_extractor=share_features_extractor,
-            features_extractor_class=features_extractor_class,
+            features_extractor_class=features_extractor_class or self.default_features_extractor_class,
             **kwargs,
         )
 
@@ -319,38 +320,14 @@ MlpPolicy = OfflinePolicy
 class CnnPolicy(OfflinePolicy):
     """
     :class:`OfflinePolicy` for images: the encoder is :class:`~sb3_offline.common.torch_layers.NormalizedNatureCNN`.
-
-    :param kwargs: see :class:`OfflinePolicy`
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NormalizedNatureCNN,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor_class = NormalizedNatureCNN
 
 
 class MultiInputPolicy(OfflinePolicy):
     """
     :class:`OfflinePolicy` for dict observations: images and vectors are encoded apart and concatenated.
-
-    :param kwargs: see :class:`OfflinePolicy`
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = StandardizedCombinedExtractor,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor_class = StandardizedCombinedExtractor
