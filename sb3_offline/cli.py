@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(f'sb3-offline: {error}; install it with: pip install "sb3-offline[{extra}]"')
 
 
-_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots", "imageio": "plots"}
+_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots"}
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -25,6 +25,8 @@ class BCPolicy(OfflinePolicy):
         std_min: float = 0.05,
         **kwargs: Any,
     ):
+        if share_features_extractor:
+            raise TypeError("BC has no critic that its actor could share an encoder with")
         super().__init__(
             observation_space,
             action_space,

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name
 
 from sb3_offline.ceborl.losses import (
     advantage_weights,
@@ -199,6 +200,8 @@ class CEBORL(ExampleBasedAlgorithm):
         super()._create_aliases()
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)
@@ -206,13 +209,13 @@ class CEBORL(ExampleBasedAlgorithm):
 
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            features = self.critic.encode(self.augment(batch.observations))
+            observations = self.augment(batch.observations)
+            features = self.critic.encode(observations)
             examples = self.augment(self.sample_examples())
             example_features = self.critic.encode(examples)
-            # The policy reads the critic's features and does not train them.
-            policy_features = features.detach()
+            policy_features = self._policy_features(observations, features)
             with th.no_grad():
-                example_actions, _ = self.actor.sample(example_features)
+                example_actions, _ = self.actor.sample(self._policy_features(examples, example_features))
                 discounted_omega = self._discounted_omega(batch)
                 example_omega = self._example_omega(examples, example_actions)
 
@@ -249,7 +252,7 @@ class CEBORL(ExampleBasedAlgorithm):
                 self._record(effective_weights=weights.sum() ** 2 / weights.pow(2).sum() / batch_size)
             else:  # Eq. 11
                 actions, log_prob = self.actor.sample(policy_features)
-                classifier = self.critic.values(policy_features, actions).amin(dim=0).sigmoid()
+                classifier = self.critic.values(features.detach(), actions).amin(dim=0).sigmoid()
                 actor_loss = (self.ent_coef * log_prob - classifier).mean()
             self._optimize(self.actor.optimizer, actor_loss)
 
@@ -262,7 +265,11 @@ class CEBORL(ExampleBasedAlgorithm):
                 classifier_examples=example_logits.sigmoid().mean(),
             )
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
-                self._record_diagnostics(policy_features, discounted_omega / self.gamma)
+                self._record_diagnostics(features, policy_features, discounted_omega / self.gamma)
+
+    def _policy_features(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
+        """The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own."""
+        return features.detach() if self.policy.share_features_extractor else self.actor.encode(observations)
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         """
@@ -302,7 +309,9 @@ class CEBORL(ExampleBasedAlgorithm):
         else:
             assert dataset_actions is not None
             actions = dataset_actions
-        return self.critic_target.values(self.critic_target.encode(observations), actions)
+        logits = self.critic_target.values(self.critic_target.encode(observations), actions)
+        self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
+        return logits
 
     def _sample_penalized_actions(self, features: th.Tensor) -> th.Tensor:
         """
@@ -318,20 +327,18 @@ class CEBORL(ExampleBasedAlgorithm):
             return th.cat([uniform, self.actor.sample(features, n_policy)[0]], dim=1)
 
     @th.no_grad()
-    def _record_diagnostics(self, features: th.Tensor, omega: th.Tensor) -> None:
-        actions, log_prob = self.actor.sample(features)
+    def _record_diagnostics(self, features: th.Tensor, policy_features: th.Tensor, omega: th.Tensor) -> None:
+        actions, log_prob = self.actor.sample(policy_features)
         p50, p99 = th.quantile(omega, th.tensor([0.5, 0.99], device=omega.device))
         self._record(
             log_prob=log_prob.mean(),
             classifier_policy=self.critic.values(features, actions).amin(dim=0).sigmoid().mean(),
             omega_p50=p50,
             omega_p99=p99,
-            # Half of the bound: one of the two horizons is at it.
-            omega_clipped=(omega >= 0.5 * self.omega_max).float().mean(),
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "critic", "critic_target"]
+        return [*super()._excluded_save_params(), "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

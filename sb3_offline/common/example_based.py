@@ -43,13 +43,14 @@ class ExampleBasedAlgorithm(OfflineAlgorithm):
         self.examples = examples
         self.example_batch_size = example_batch_size
         self._example_arrays: dict[str, np.ndarray] | None = None
+        self._example_source: ExampleSource | None = None
 
     def sample_examples(self) -> PyTorchObs:
         """
         :return: ``example_batch_size`` success examples, drawn with replacement, like a batch of observations
         """
-        if self._example_arrays is None:
-            self._example_arrays = self._load_examples()
+        if self._example_arrays is None or self._example_source is not self.examples:
+            self._example_arrays, self._example_source = self._load_examples(), self.examples
         arrays = self._example_arrays
         rng = self.replay_buffer.rng
         rows = rng.integers(len(next(iter(arrays.values()))), size=self.example_batch_size)
@@ -69,5 +70,5 @@ class ExampleBasedAlgorithm(OfflineAlgorithm):
         return examples if isinstance(examples, dict) else {"": examples}
 
     def _excluded_save_params(self) -> list[str]:
-        excluded = [*super()._excluded_save_params(), "_example_arrays"]
+        excluded = [*super()._excluded_save_params(), "_example_arrays", "_example_source"]
         return excluded if isinstance(self.examples, (str, PathLike)) else [*excluded, "examples"]

@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import utils
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
@@ -54,9 +54,12 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     #: whether ``train()`` needs the dataset's action at the next step (and so leaves out each episode's last step)
     needs_next_actions: bool = False
     _replay_buffer: Any
+    _replay_buffer_source: Any
     # Of the actor-critic algorithms:
     critic: th.nn.Module
     critic_target: th.nn.Module
+    batch_norm_stats: list[th.Tensor]
+    batch_norm_stats_target: list[th.Tensor]
 
     def __init__(
         self,
@@ -127,13 +130,13 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     @property
     def replay_buffer(self) -> OfflineReplayBuffer:  # type: ignore[override]
         """The dataset as SB3's replay buffer; opened at the first use."""
-        if self._replay_buffer is None:
+        if self._replay_buffer is None or self._replay_buffer_source is not self.dataset:
             if self.dataset is None:
                 raise RuntimeError(
                     f"{type(self).__name__} has no dataset to learn from: pass `dataset=` to the constructor, "
                     "or `load(path, dataset=...)`"
                 )
-            self._replay_buffer = OfflineReplayBuffer(
+            self.replay_buffer = OfflineReplayBuffer(
                 self.dataset,
                 self.observation_space,
                 self.action_space,
@@ -152,9 +155,15 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     @replay_buffer.setter
     def replay_buffer(self, buffer: ReplayBuffer | None) -> None:
         self._replay_buffer = buffer
+        self._replay_buffer_source = getattr(self, "dataset", None)
 
     def _fit_observation_statistics(self) -> None:
         normalize = self._vec_normalize_env
+        if normalize is not None and normalize.norm_obs and self.policy.standardizes:  # type: ignore[operator]
+            raise RuntimeError(
+                "The policy was fitted to plain observations, but the environment is a VecNormalize that normalises them; "
+                "use the environment without it, or train a new model with it"
+            )
         if normalize is None or not normalize.norm_obs:
             self.policy.fit_observation_statistics(self._replay_buffer.observation_statistics)  # type: ignore[operator]
         elif normalize.training:
@@ -163,6 +172,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             running = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
             for key, rms in running.items():
                 rms.mean, rms.var, rms.count = statistics[key] if key else statistics
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        if self._replay_buffer is not None:
+            self._fit_observation_statistics()
 
     def augment(self, observations: PyTorchObs) -> PyTorchObs:
         """
@@ -235,11 +249,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         return total_timesteps, self._init_callback(callback, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        callback = super()._init_callback(callback, progress_bar=False)
         if progress_bar:
-            callback = CallbackList([callback, _GradientStepBar()])
-            callback.init_callback(self)
-        return callback
+            if not isinstance(callback, list):
+                callback = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+            callback = [*callback, _GradientStepBar()]
+        return super()._init_callback(callback)
 
     def _on_step(self) -> None:
         """Called after each gradient step, before the callbacks."""
@@ -253,6 +267,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def _update_target(self) -> None:
         if self._n_updates % self.target_update_interval == 0:
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            # Running statistics of batch normalisation are copied, as in SB3's SAC.
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     # --------------------------------------------------------------- logging
 
@@ -283,7 +299,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_metrics"]
+        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_replay_buffer_source", "_metrics"]
         # An open dataset holds file maps; paths are kept, so that `load` can go on learning.
         return [*excluded, "dataset"] if isinstance(self.dataset, OfflineDataset) else excluded
 

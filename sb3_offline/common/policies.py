@@ -15,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
@@ -290,28 +290,38 @@ class OfflinePolicy(SACPolicy):
         )
         return data
 
-    def fit_observation_statistics(self, statistics: Callable[[], Any]) -> None:
+    def fit_observation_statistics(self, statistics: Callable[[list[str] | None], Any]) -> None:
         """
         Fit every :class:`~sb3_offline.common.torch_layers.StandardizedExtractor` that is not fitted yet.
 
-        :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for dict
-            observations; called only where a policy standardises
+        :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for the named keys
+            of dict observations; called only where there is something to fit
         """
+        unfitted = {encoder: key for encoder, key in self._standardized_encoders().items() if not encoder.fitted}
+        if unfitted:
+            moments = statistics([key for key in unfitted.values() if key] or None)
+            for encoder, key in unfitted.items():
+                mean, variance, _ = moments[key] if key else moments
+                encoder.fit(np.asarray(mean), np.asarray(variance))
+
+    @property
+    def standardizes(self) -> bool:
+        """Whether statistics of a dataset are fitted already."""
+        return any(bool(encoder.fitted) for encoder in self._standardized_encoders())
+
+    def _standardized_encoders(self) -> dict[StandardizedExtractor, str]:
+        """Encoders of vectors, with their keys in dict observations. One-hot vectors and flattened images stay as they are."""
         encoders = {
             module: ""
             for module in self.modules()
-            # One-hot vectors (of Discrete spaces) stay as they are.
-            if isinstance(module, StandardizedExtractor) and isinstance(module._observation_space, spaces.Box)
+            if isinstance(module, StandardizedExtractor)
+            and isinstance(module._observation_space, spaces.Box)
+            and not is_image_space(module._observation_space, check_channels=False)
         }
         for module in self.modules():
             if isinstance(module, StandardizedCombinedExtractor):
                 encoders.update({part: key for key, part in module.extractors.items() if part in encoders})
-        unfitted = {encoder: key for encoder, key in encoders.items() if not encoder.fitted}
-        if unfitted:
-            moments = statistics()
-            for encoder, key in unfitted.items():
-                mean, variance, _ = moments[key] if key else moments
-                encoder.fit(np.asarray(mean), np.asarray(variance))
+        return encoders
 
 
 MlpPolicy = OfflinePolicy

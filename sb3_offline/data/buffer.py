@@ -1,6 +1,7 @@
 """A replay buffer over datasets on disk."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -221,14 +222,16 @@ class OfflineReplayBuffer(ReplayBuffer):
     def _column(self, values: np.ndarray) -> th.Tensor:
         return self._to_device(values.astype(np.float32).reshape(-1, 1))
 
-    def observation_statistics(self) -> Any:
+    def observation_statistics(self, keys: Sequence[str] | None = None) -> Any:
         """
         Moments of all observations in the files, the last ones of episodes too, e.g. for ``VecNormalize.obs_rms``.
 
+        :param keys: of a Dict space, those that are wanted (default: all)
         :return: (mean, variance, count) with mean and variance float64 of the learner's shape; for a Dict space a dict of such
         """
         plain = subspaces(self.observation_space, "observations")
-        moments = {n.removeprefix("observations/"): self._moments(n, self._stores[n], s) for n, s in plain.items()}
+        names = {n.removeprefix("observations/"): n for n in plain}
+        moments = {key: self._moments(n, self._stores[n], plain[n]) for key, n in names.items() if not keys or key in keys}
         return moments if isinstance(self.observation_space, spaces.Dict) else moments["observations"]
 
     def _moments(self, name: str, store: RowStore, space: spaces.Space) -> tuple[np.ndarray, np.ndarray, int]:

@@ -10,6 +10,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
+#: Far from the seeds that data are collected with.
+EVALUATION_SEED = 100_000
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -57,7 +60,7 @@ def make_evaluation_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> V
 
 
 def evaluate_success(
-    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], n_episodes: int = 50, seed: int = 100_000
+    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], n_episodes: int = 50, seed: int = EVALUATION_SEED
 ) -> Evaluation:
     """
     Play the policy's mode. The environment is new at each call, so that the same seed gives the same episodes.

@@ -8,22 +8,19 @@ import numpy as np
 from PIL import Image, ImageDraw
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from sb3_offline.experiment.evaluation import EVALUATION_SEED
+
 FRAME_MS = 80
 LAST_FRAME_MS = 800
 
 
-def record_episode(
-    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], seed: int, size: int = 200
-) -> tuple[list[np.ndarray], bool]:
+def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None) -> tuple[list[np.ndarray], bool]:
     """
     :param model: plays its mode
-    :param env_id: registered id
-    :param env_kwargs: of the environment
-    :param seed: of the episode
-    :param size: width and height of the frames, in pixels
-    :return: frames ``(size, size, 3)`` uint8, one a decision, until the task is solved and a little longer; and whether it was
+    :param env: with ``render_mode="rgb_array"``
+    :param seed: of the episode; ``None`` goes on with the environment's own generator
+    :return: frames uint8, one a decision, until the task is solved and a little longer; and whether it was
     """
-    env = gym.make(env_id, render_mode="rgb_array", width=size, height=size, **env_kwargs)
     observation, _ = env.reset(seed=seed)
     frames, solved_for, done = [env.render()], 0, False
     while not done and solved_for < 5:
@@ -32,27 +29,35 @@ def record_episode(
         frames.append(env.render())
         done = terminated or truncated
         solved_for += bool(info["is_success"])
-    env.close()
     return frames, solved_for > 0  # type: ignore[return-value]
 
 
 def record_gif(
-    model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], path: Path, n_episodes: int = 3, seed: int = 100_000
+    model: PolicyPredictor,
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    path: Path,
+    n_episodes: int = 3,
+    seed: int = EVALUATION_SEED,
+    size: int = 200,
 ) -> list[bool]:
     """
-    The first episodes from a seed on, whatever comes of them, one after the other in a GIF.
+    The first episodes of :func:`~sb3_offline.experiment.evaluation.evaluate_success` with this seed, whatever comes of
+    them, one after the other in a GIF.
 
     :param model: plays its mode
     :param env_id: registered id
     :param env_kwargs: of the environment
     :param path: of the GIF
     :param n_episodes: how many
-    :param seed: of the first
+    :param seed: of the first; the others go on with the same generator
+    :param size: width and height in pixels
     :return: which of them were solved
     """
+    env = gym.make(env_id, render_mode="rgb_array", width=size, height=size, **env_kwargs)
     pictures, durations, outcomes = [], [], []
     for index in range(n_episodes):
-        frames, solved = record_episode(model, env_id, env_kwargs, seed + index)
+        frames, solved = record_episode(model, env, seed if index == 0 else None)
         outcomes.append(solved)
         for number, frame in enumerate(frames):
             picture = Image.fromarray(frame)
@@ -61,6 +66,7 @@ def record_gif(
             ImageDraw.Draw(picture).text((6, 4), text, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
             pictures.append(picture.quantize(128, dither=Image.Dither.NONE))
             durations.append(LAST_FRAME_MS if last else FRAME_MS)
+    env.close()
     path.parent.mkdir(parents=True, exist_ok=True)
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
     return outcomes
