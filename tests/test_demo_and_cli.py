@@ -78,11 +78,17 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "nothing"], "no such config file.*ceborl_paper"),
         (["train", "--dataset", "x.h5", "-o", "run", "--hyperparams", "beta"], "key:value"),
         (["train", "--dataset", "x.h5", "-o", "run", "--algo", "dqn", "--config", "bc"], "no algorithm 'dqn'.*ceborl"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--config", "list.yml"], "list.yml: has no sections"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--config", "short.yml"], "short.yml: .*lacks n_timesteps"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--config", "broken.yml"], "broken.yml: is not YAML"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--env", "No-v0", "--eval-freq", "1"], "no environment 'No-v0'"),
         (["collect", "out.h5", "--tasks", "door-shut"], "door-shut"),
     ],
 )
 def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for name, text in {"list": "- 1", "short": "default: {policy: MlpPolicy}", "broken": "a: ["}.items():
+        (tmp_path / f"{name}.yml").write_text(text)
     with pytest.raises(SystemExit, match=f"(?s)sb3-offline: .*{message}"):
         cli.main(arguments)
     assert not list(tmp_path.glob("**/*.h5"))

@@ -21,7 +21,7 @@ from sb3_offline.common.policies import OfflineActor, OfflineCritic, OfflinePoli
 from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.reader import DatasetSource
 
-#: The paper's Eq. 10 and 11 to the letter, as constructor arguments.
+#: The paper's Eq. 10 and 11 as its appendix trains them, as constructor arguments.
 PAPER_FORM: dict[str, Any] = {
     "backup": "policy",
     "policy_extraction": "maximize",

@@ -224,6 +224,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             if log_interval is not None and self.num_timesteps % log_interval == 0:
                 self.dump_logs()
 
+        if self._metrics and log_interval is not None:
+            self.dump_logs()
         callback.on_training_end()
         return self
 

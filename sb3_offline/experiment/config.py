@@ -30,11 +30,18 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
     if not path.is_file():
         shipped = sorted(file.stem for file in config_path("ceborl").parent.glob("*.yml"))
         raise RuntimeError(f"{path}: there is no such config file; give a path, or one of {', '.join(shipped)}")
-    with path.open() as file:
-        sections = yaml.safe_load(file)
-    section = (sections or {}).get(env_id, (sections or {}).get("default"))
+    try:
+        sections = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+    if not isinstance(sections, dict):
+        raise RuntimeError(f"{path}: has no sections; write `{env_id}:` and hyperparameters below it, indented")
+    section = sections.get(env_id, sections.get("default"))
     if not isinstance(section, dict):
-        raise RuntimeError(f"{path}: has no section {env_id!r} and no 'default'; its sections are {sorted(sections or {})}")
+        raise RuntimeError(f"{path}: has no section {env_id!r} and no 'default'; its sections are {sorted(sections)}")
+    missing = {"policy", "n_timesteps"} - section.keys()
+    if missing:
+        raise RuntimeError(f"{path}: its section for {env_id} lacks {', '.join(sorted(missing))}; add it")
     return dict(section)
 
 

@@ -60,6 +60,8 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
                         future.result()  # raises what went wrong in there, without waiting for the others
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
             raise
     for label, bar in bars.items():
         bar.update(runs[label]["config"]["n_timesteps"] - bar.n)

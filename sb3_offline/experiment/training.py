@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
@@ -92,7 +93,7 @@ def create_model(
     try:
         return find_algorithm(algo)(env=None, **arguments)  # type: ignore[arg-type]
     except TypeError as error:
-        raise RuntimeError(f"{algo}: {error}; check the config and --hyperparams") from error
+        raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams and --examples") from error
 
 
 def train(
@@ -131,6 +132,11 @@ def train(
     """
     # Saturated classifiers make denormal numbers, which are many times slower.
     th.set_flush_denormal(True)
+    if eval_freq:
+        try:
+            gym.spec(env_id)
+        except gym.error.Error as error:
+            raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
     output.mkdir(parents=True, exist_ok=True)
     all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
     model = create_model(algo, config, dataset, examples, seed, verbose=verbose)

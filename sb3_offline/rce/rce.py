@@ -4,7 +4,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.ceborl.ceborl import CEBORL
 from sb3_offline.ceborl.losses import success_odds
@@ -25,6 +25,7 @@ class RCE(CEBORL):
     :param env: see :class:`~sb3_offline.ceborl.ceborl.CEBORL`
     :param dataset: see :class:`~sb3_offline.ceborl.ceborl.CEBORL`
     :param examples: see :class:`~sb3_offline.ceborl.ceborl.CEBORL`
+    :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
     :param n_steps: 1, or the longer of the two horizons
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param kwargs: the other arguments of :class:`~sb3_offline.ceborl.ceborl.CEBORL`
@@ -36,6 +37,7 @@ class RCE(CEBORL):
         env: GymEnv | str | None = None,
         dataset: DatasetSource | None = None,
         examples: ExampleSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
         n_steps: int = 1,
         tau: float = 0.005,
         **kwargs: Any,
@@ -47,7 +49,7 @@ class RCE(CEBORL):
             "initial_odds": 1.0,
             "example_share": 0.0,
         }
-        super().__init__(policy, env, dataset, examples, n_steps=n_steps, tau=tau, **{**defaults, **kwargs})
+        super().__init__(policy, env, dataset, examples, learning_rate, n_steps=n_steps, tau=tau, **{**defaults, **kwargs})
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         if self.n_steps == 1:
