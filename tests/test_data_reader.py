@@ -4,9 +4,10 @@ import pickle
 import h5py
 import numpy as np
 import pytest
-from data_files import ACTIONS, BOTH, IMAGES, STATES, write_dataset
+from data_files import ACTIONS, IMAGES, STATES, write_dataset
 from gymnasium import spaces
 
+from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset, open_datasets
 
@@ -90,10 +91,15 @@ def test_damage_is_named_by_file_field_and_remedy(tmp_path, damage, message):
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_nan_in_states_is_found(tmp_path):
-    write_dataset(tmp_path / "d.h5", space=BOTH)
+@pytest.mark.parametrize("storage", ["contiguous", "compressed"])
+@pytest.mark.parametrize("state", [STATES, spaces.Box(-1, 1, (4, 3))])
+def test_nan_in_states_is_found(tmp_path, monkeypatch, storage, state):
+    monkeypatch.setattr("sb3_offline.data.reader.CHECK_BYTES", 100)  # several pieces
+    write_dataset(tmp_path / "whole.h5", space=spaces.Dict({"image": IMAGES, "state": state}))
+    convert(tmp_path / "whole.h5", tmp_path / "d.h5", storage, progress_bar=False)
+    assert OfflineDataset(tmp_path / "d.h5").storage == storage
     set_row("observations/state", (7, 2), np.nan)(tmp_path / "d.h5")
-    with pytest.raises(DatasetError, match="observations/state: holds NaN or infinity, first in row 7"):
+    with pytest.raises(DatasetError, match="d.h5: observations/state: holds NaN or infinity, first in row 7. Leave"):
         OfflineDataset(tmp_path / "d.h5")
 
 

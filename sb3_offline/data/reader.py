@@ -16,6 +16,8 @@ from sb3_offline.data.files import open_hdf5
 from sb3_offline.data.format import Field, Header, Storage, read_header
 from sb3_offline.data.spaces import subspaces
 
+CHECK_BYTES = 1 << 24
+
 
 class HDF5Array:
     """
@@ -156,14 +158,11 @@ class OfflineDataset:
         return array[:rows]
 
     def _check(self, arrays: dict[str, Any]) -> None:
-        """Check the values of the small arrays. Integer frames cannot hold NaN and are left alone, whatever their size."""
-        vectors = [n for n, s in subspaces(self.observation_space, "observations").items() if len(s.shape or ()) <= 1]
-        for name in ["actions", "rewards", *vectors]:
-            array = arrays.get(name)
-            if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
-                row = int(np.argmin(np.isfinite(array).reshape(len(array), -1).all(axis=1)))
-                remedy = "Leave that episode out when writing the file"
-                raise DatasetError(self.path, name, f"holds NaN or infinity, first in row {row}", remedy)
+        """Check the values of everything but images: those are large, and in integers cannot hold NaN."""
+        small = [n for n, s in subspaces(self.observation_space, "observations").items() if len(s.shape or ()) != 3]
+        for name in ["actions", "rewards", *small]:
+            if name in arrays and arrays[name].dtype.kind == "f":
+                self._check_finite(name, arrays[name])
         inside = np.ones(self.n_steps, dtype=bool)
         inside[self.step_starts + self.lengths - 1] = False
         for name in ("terminated", "truncated"):
@@ -175,6 +174,15 @@ class OfflineDataset:
             if self.source.min() < 0 or self.source.max() >= len(self.sources):
                 problem = f"has indices up to {self.source.max()}, but there are {len(self.sources)} labels"
                 raise DatasetError(self.path, "episodes/source", problem, "Write the file again with all labels")
+
+    def _check_finite(self, name: str, array: ArrayLike) -> None:
+        rows = max(CHECK_BYTES // max(array.dtype.itemsize * int(np.prod(array.shape[1:])), 1), 1)
+        for first in range(0, len(array), rows):  # by pieces: an array in compressed storage is read for this
+            finite = np.isfinite(array[first : first + rows])
+            if not finite.all():
+                row = first + int(np.argmin(finite.reshape(len(finite), -1).all(axis=1)))
+                remedy = "Leave that episode out when writing the file"
+                raise DatasetError(self.path, name, f"holds NaN or infinity, first in row {row}", remedy)
 
     def __reduce__(self) -> tuple:
         return _reopen, (self.path, self._given_spaces)
