@@ -99,7 +99,7 @@ def test_nan_in_states_is_found(tmp_path, monkeypatch, storage, state):
     convert(tmp_path / "whole.h5", tmp_path / "d.h5", storage, progress_bar=False)
     assert OfflineDataset(tmp_path / "d.h5").storage == storage
     set_row("observations/state", (7, 2), np.nan)(tmp_path / "d.h5")
-    with pytest.raises(DatasetError, match="d.h5: observations/state: holds NaN or infinity, first in row 7. Leave"):
+    with pytest.raises(DatasetError, match=r"d.h5: observations/state: holds NaN or infinity, first in row 7. Leave"):
         OfflineDataset(tmp_path / "d.h5")
 
 
