@@ -138,6 +138,16 @@ def test_append_adds_sources_and_provenance_and_refuses_other_contents(tmp_path)
     assert_holds(OfflineDataset(path), [make_episode(5), make_episode(6)])
 
 
+def test_a_refused_writer_lets_the_file_go(tmp_path):
+    write_dataset(tmp_path / "d.h5", 1)
+    with pytest.raises(DatasetError, match="same spaces") as caught:
+        DatasetWriter(tmp_path / "d.h5", data_files.STATES, ACTIONS, **OPTIONS, mode="a")
+    with DatasetWriter(tmp_path / "d.h5", IMAGES, ACTIONS, **OPTIONS, mode="a") as writer:
+        writer.add_episode(**make_episode(1))
+    assert caught.value.__traceback__ is not None  # as in an interactive session, which keeps the last error
+    assert_holds(OfflineDataset(tmp_path / "d.h5"), [make_episode(0), make_episode(1)])
+
+
 def test_reading_while_the_file_is_replaced(tmp_path, monkeypatch):
     with DatasetWriter(tmp_path / "d.h5", IMAGES, ACTIONS, **OPTIONS, capacity=(1, 13)) as writer:
         writer.add_episode(**make_episode(0))

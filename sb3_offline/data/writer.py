@@ -76,6 +76,13 @@ class DatasetWriter:
             extras=dict(extras or {}),
         )
         self._fields = self._header.fields()
+        try:
+            self._open(mode, capacity)
+        except BaseException:
+            self._release()  # the error's traceback keeps this object, and with it the lock
+            raise
+
+    def _open(self, mode: str, capacity: tuple[int, int]) -> None:
         if self.path.exists():
             if mode == "x":
                 raise DatasetError(self.path, "file", "exists already", 'Open it with mode="a" to append or "w" to replace it')
@@ -145,6 +152,10 @@ class DatasetWriter:
             if self._capacity != (self.n_episodes, self.n_steps):
                 self._rewrite((self.n_episodes, self.n_steps))
         finally:
+            self._release()
+
+    def _release(self) -> None:
+        if self._file is not None:
             self._file.close()
             self._file = None
 
@@ -184,8 +195,7 @@ class DatasetWriter:
 
     def _attach(self) -> None:
         """Open the file at its path for writing, as the only writer."""
-        if self._file is not None:
-            self._file.close()
+        self._release()
         self._file = open(self.path, "r+b", buffering=0)
         _lock(self._file, self.path)
 
