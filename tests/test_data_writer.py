@@ -148,6 +148,27 @@ def test_a_refused_writer_lets_the_file_go(tmp_path):
     assert_holds(OfflineDataset(tmp_path / "d.h5"), [make_episode(0), make_episode(1)])
 
 
+def test_the_old_file_stays_until_there_is_something_to_replace_it(tmp_path):
+    path = tmp_path / "d.h5"
+    write_dataset(path, 2)
+    with pytest.raises(KeyboardInterrupt), DatasetWriter(path, IMAGES, ACTIONS, **OPTIONS, mode="w"):
+        raise KeyboardInterrupt
+    assert_holds(OfflineDataset(path), [make_episode(0), make_episode(1)])
+    with DatasetWriter(path, IMAGES, ACTIONS, **OPTIONS, mode="w", capacity=(1, 1)) as writer:
+        with pytest.raises(DatasetError, match="actions: holds NaN"):
+            writer.add_episode(**{**make_episode(5, n=5), "actions": np.full((5, 2), np.nan)})
+        assert_holds(OfflineDataset(path), [make_episode(0), make_episode(1)])
+        for index in (5, 6):
+            writer.add_episode(**make_episode(index))
+            assert_holds(OfflineDataset(path), [make_episode(i) for i in range(5, index + 1)])
+    written = path.read_bytes()
+    path.unlink()
+    write_dataset(path, 2, first=5)
+    assert written == path.read_bytes()
+    DatasetWriter(path, IMAGES, ACTIONS, **OPTIONS, mode="w").close()
+    assert OfflineDataset(path).n_episodes == 0 and os.listdir(tmp_path) == ["d.h5"]
+
+
 def test_reading_while_the_file_is_replaced(tmp_path, monkeypatch):
     with DatasetWriter(tmp_path / "d.h5", IMAGES, ACTIONS, **OPTIONS, capacity=(1, 13)) as writer:
         writer.add_episode(**make_episode(0))

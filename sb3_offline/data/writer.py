@@ -34,7 +34,8 @@ class DatasetWriter:
     :param env_kwargs: its keyword arguments (JSON)
     :param provenance: where the data come from: program, command, seed, versions, policy, ... (JSON). When appending, a
         provenance other than the file's is added to the list ``provenance["appended"]``
-    :param mode: "x": the file must not exist; "w": replace it; "a": append to it (which copies it once), or create it
+    :param mode: "x": the file must not exist; "w": replace it, once the first episode is there (or on closing without an
+        error); "a": append to it (which copies it once), or create it
     :param rewards: whether episodes have rewards
     :param success: whether episodes have success labels
     :param extras: further per-step arrays: name to (shape of one row, dtype)
@@ -64,6 +65,7 @@ class DatasetWriter:
         self.n_episodes = 0
         self.n_steps = 0
         self._file: Any = None
+        self._replaces = False  # whether the file at the path still is the old one, which this one is to replace
         self._header = Header(
             observation_space,
             action_space,
@@ -90,7 +92,12 @@ class DatasetWriter:
             if mode == "a":
                 self._adopt()
         temporary_path(self.path).unlink(missing_ok=True)  # what a killed writer left; the lock says that it is gone
-        self._rewrite((self.n_episodes + max(capacity[0], 1), self.n_steps + max(capacity[1], 1)))
+        self._capacity = (self.n_episodes + max(capacity[0], 1), self.n_steps + max(capacity[1], 1))
+        if self._file is not None and mode == "w":
+            self._header.attributes()  # what cannot be stored is refused here already
+            self._replaces = True
+        else:
+            self._rewrite(self._capacity)
 
     def add_episode(
         self,
@@ -134,13 +141,10 @@ class DatasetWriter:
         rows = check_observations(observations, self._header.observation_space, n + 1, self.path)
         rows |= self._check_steps({name: value for name, value in steps.items() if value is not None}, n)
         rows |= self._episode_rows(n, seed, source)
-        if self.n_episodes + 1 > self._capacity[0] or self.n_steps + n > self._capacity[1]:
-            self._rewrite((2 * self._capacity[0], 2 * self._capacity[1] + n))
-        for name, array in rows.items():
-            first_row = self._fields[name].rows(self.n_episodes, self.n_steps)
-            self._write(self._offsets[name] + first_row * self._fields[name].row_bytes, array)
-        os.fsync(self._file.fileno())  # the order matters: rows on disk first, then the number that makes them exist
-        self._write(self._offsets["n_episodes"], np.array(self.n_episodes + 1, dtype=np.int64))
+        if self._replaces:
+            self._rewrite((self._capacity[0], max(self._capacity[1], n)), rows)
+        else:
+            self._commit(rows, n)
         self.n_episodes += 1
         self.n_steps += n
 
@@ -149,7 +153,7 @@ class DatasetWriter:
         if self._file is None:
             return
         try:
-            if self._capacity != (self.n_episodes, self.n_steps):
+            if self._replaces or self._capacity != (self.n_episodes, self.n_steps):
                 self._rewrite((self.n_episodes, self.n_steps))
         finally:
             self._release()
@@ -162,8 +166,11 @@ class DatasetWriter:
     def __enter__(self) -> "DatasetWriter":
         return self
 
-    def __exit__(self, *exc_info: Any) -> None:
-        self.close()
+    def __exit__(self, exc_type: Any, *exc_info: Any) -> None:
+        if exc_type is not None and self._replaces:
+            self._release()  # nothing came to replace the old file
+        else:
+            self.close()
 
     def _check_steps(self, values: dict[str, Any], n: int) -> dict[str, np.ndarray]:
         """Check the arrays with one row per step, given by their names in the file."""
@@ -188,6 +195,15 @@ class DatasetWriter:
         if sources is not None:
             rows["episodes/source"] = np.array([sources.index(str(source))], np.int16)
         return rows
+
+    def _commit(self, rows: dict[str, np.ndarray], n: int) -> None:
+        if self.n_episodes + 1 > self._capacity[0] or self.n_steps + n > self._capacity[1]:
+            self._rewrite((2 * self._capacity[0], 2 * self._capacity[1] + n))
+        for name, array in rows.items():
+            first_row = self._fields[name].rows(self.n_episodes, self.n_steps)
+            self._write(self._offsets[name] + first_row * self._fields[name].row_bytes, array)
+        os.fsync(self._file.fileno())  # the order matters: rows on disk first, then the number that makes them exist
+        self._write(self._offsets["n_episodes"], np.array(self.n_episodes + 1, dtype=np.int64))
 
     def _write(self, offset: int, array: np.ndarray) -> None:
         self._file.seek(offset)
@@ -231,15 +247,23 @@ class DatasetWriter:
             problem = f"has other arrays ({sorted(present.fields())}) than those to be appended ({sorted(wanted.fields())})"
             raise DatasetError(self.path, "file", problem, "Append with the same arrays, or write another file")
 
-    def _rewrite(self, capacity: tuple[int, int]) -> None:
-        """Copy the committed rows to a file of another capacity, which then replaces this one; also creates a file."""
+    def _rewrite(self, capacity: tuple[int, int], first: dict[str, np.ndarray] | None = None) -> None:
+        """
+        Copy the committed rows to a file of another capacity, which then replaces this one; also creates a file, empty or with
+        the rows of its first episode.
+        """
         with replacing(self.path) as temporary:
-            create_file(temporary, self._header, *capacity, committed=self.n_episodes)
+            create_file(temporary, self._header, *capacity, committed=1 if first else self.n_episodes)
+            if first:
+                with h5py.File(temporary, "r+", locking=False) as file:
+                    for name, array in first.items():
+                        file[name][: len(array)] = array
             if self.n_episodes:
                 with open_hdf5(temporary) as file, open(temporary, "r+b", buffering=0) as target:
                     for name, spec in self._fields.items():
                         size = spec.rows(self.n_episodes, self.n_steps) * spec.row_bytes
                         _copy(self._file, self._offsets[name], target, file[name].id.get_offset(), size)
+        self._replaces = False
         self._attach()
         with open_hdf5(self.path) as file:
             self._read_places(file)
