@@ -209,6 +209,12 @@ def test_one_writer_many_readers(tmp_path):
         ({"terminated": np.ones(5, bool)}, "terminated: is true before the last step.*split"),
         ({"extras": {"qpos": np.zeros((5, 2)), "qvel": np.zeros(5)}}, "extras/qvel: is not an array of this file"),
         ({"source": "above"}, "source: is 'above', the file's sources are"),
+        ({"terminated": True}, r"terminated: has shape \(\), expected \(5,\)"),
+        ({"terminated": []}, r"terminated: has shape \(0,\), expected \(5,\)"),
+        ({"observations": [[1], [2, 3]]}, r"observations: is no array \(.*\). Give rows of one shape"),
+        ({"actions": [[1], [2, 3]]}, "actions: is no array"),
+        ({"seed": 2**63}, "seed: is 9223372036854775808, no integer of 64 bits"),
+        ({"seed": None}, "seed: is None, no integer"),
     ],
 )
 def test_a_bad_episode_is_refused_whole(tmp_path, change, message):
@@ -218,6 +224,12 @@ def test_a_bad_episode_is_refused_whole(tmp_path, change, message):
             writer.add_episode(**{**make_episode(1, n=5), **change})
         writer.add_episode(**make_episode(2))
     assert_holds(OfflineDataset(tmp_path / "d.h5"), [make_episode(0), make_episode(2)])
+
+
+def test_an_episode_of_a_file_with_an_empty_list_of_sources_is_refused(tmp_path):
+    with DatasetWriter(tmp_path / "d.h5", IMAGES, ACTIONS, **{**OPTIONS, "sources": []}) as writer:
+        with pytest.raises(DatasetError, match=r"source: is None, the file's sources are \[\]"):
+            writer.add_episode(**{**make_episode(0), "source": None})
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,19 @@ def check_observations(
     return checked
 
 
+def to_array(value: Any, file: str | os.PathLike, field: str) -> np.ndarray:
+    """
+    :param value: array-like
+    :param file: for the error message
+    :param field: for the error message
+    :return: the array; raises ``DatasetError`` where rows differ in shape
+    """
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise DatasetError(file, field, f"is no array ({error})", "Give rows of one shape") from error
+
+
 def check_rows(
     value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
 ) -> np.ndarray:
@@ -127,7 +140,7 @@ def check_rows(
     :return: array of shape ``(rows, *shape)``; raises ``DatasetError`` on another shape or dtype, values outside of the
         dtype's range, NaN or infinity
     """
-    array = np.asarray(value)
+    array = to_array(value, file, field)
     if array.ndim == 0 or array.shape[1:] != shape or rows not in (None, len(array)):
         wanted = ("n" if rows is None else rows, *shape)
         problem = f"has shape {array.shape}, expected ({', '.join(map(str, wanted))}{',' if not shape else ''})"

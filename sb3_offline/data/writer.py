@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import open_hdf5, replacing, temporary_path
 from sb3_offline.data.format import Header, create_file, read_header
-from sb3_offline.data.spaces import check_observations, check_rows
+from sb3_offline.data.spaces import check_observations, check_rows, to_array
 
 COPY_BYTES = 1 << 24
 
@@ -128,14 +128,16 @@ class DatasetWriter:
         """
         if self._file is None:
             raise DatasetError(self.path, "file", "is closed", "Open a new DatasetWriter with mode='a'")
-        n = len(actions) if np.ndim(actions) else 0
+        actions = to_array(actions, self.path, "actions")
+        n = len(actions) if actions.ndim else 0
         if n == 0:
             raise DatasetError(self.path, "actions", "holds no step", "Leave empty episodes out")
         if terminated is None:
             terminated = np.zeros(n, dtype=bool)
         if truncated is None:
+            terminated = check_rows(terminated, (), np.dtype(bool), n, self.path, "terminated")
             truncated = np.zeros(n, dtype=bool)
-            truncated[-1] = not np.asarray(terminated)[-1]
+            truncated[-1] = not terminated[-1]
         steps = {"actions": actions, "rewards": rewards, "terminated": terminated, "truncated": truncated, "success": success}
         steps |= {f"extras/{name}": value for name, value in (extras or {}).items()}
         rows = check_observations(observations, self._header.observation_space, n + 1, self.path)
@@ -187,9 +189,13 @@ class DatasetWriter:
         return rows
 
     def _episode_rows(self, n: int, seed: int, source: str | None) -> dict[str, np.ndarray]:
+        if not (isinstance(seed, int | np.integer) and -(2**63) <= seed < 2**63):
+            raise DatasetError(
+                self.path, "seed", f"is {seed!r}, no integer of 64 bits", "Give the episode's seed, or -1 for none"
+            )
         rows = {"episodes/length": np.array([n], np.int64), "episodes/seed": np.array([seed], np.int64)}
         sources = self._header.sources
-        if (source not in sources) if sources else (source is not None):
+        if (source not in sources) if sources is not None else (source is not None):
             problem = f"is {source!r}, the file's sources are {sources}"
             raise DatasetError(self.path, "source", problem, "Name one of them, or give all labels when creating the file")
         if sources is not None:
