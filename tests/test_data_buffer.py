@@ -154,6 +154,14 @@ def test_actions_a_little_outside_are_clipped_and_others_warned_of(tmp_path):
         np.testing.assert_array_equal(write(tmp_path / "b.h5", [[-3, 5], [2, 5]]).actions, [[-1, 0], [1, 0]])
 
 
+def test_an_action_without_a_choice_is_refused(tmp_path):
+    fixed = spaces.Box(np.array([-1, 3], np.float32), np.array([1, 3], np.float32))
+    with DatasetWriter(tmp_path / "a.h5", STATES, fixed, success=False, rewards=False) as writer:
+        writer.add_episode(np.zeros((3, 3)), [[0, 3], [1, 3]])
+    with pytest.raises(DatasetError, match=r"a.h5: action_space: leaves no choice in dimension 1"):
+        OfflineReplayBuffer(tmp_path / "a.h5", STATES, fixed, "cpu")
+
+
 def test_resume_continues_with_the_same_batches(tmp_path):
     write_dataset(tmp_path / "a.h5")
     buffer = OfflineReplayBuffer(tmp_path / "a.h5", CHANNEL_FIRST, ACTIONS, "cpu", n_steps=3, next_actions=True, seed=1)

@@ -135,6 +135,10 @@ class OfflineReplayBuffer(ReplayBuffer):
         if not (np.isfinite(low) & np.isfinite(high)).all():
             remedy = "Bound the actions of the environment (gymnasium.wrappers.RescaleAction)"
             raise DatasetError(path, "action_space", "has infinite bounds, so actions cannot be scaled", remedy)
+        if not (low < high).all():
+            problem = f"leaves no choice in dimension {int(np.argmin(low < high))} (low equals high)"
+            remedy = "Leave it out of the actions (gymnasium.ActionWrapper), in the environment and in the data"
+            raise DatasetError(path, "action_space", problem, remedy)
         scaled = 2.0 * ((actions - low) / (high - low)) - 1.0
         outside = (np.abs(scaled) > 1 + 1e-4).any(axis=1)
         if outside.any():
