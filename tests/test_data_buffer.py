@@ -1,5 +1,6 @@
 import pickle
 
+import h5py
 import numpy as np
 import pytest
 import torch as th
@@ -13,6 +14,7 @@ from sb3_offline.data import storage as storage_module
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
 
 CHANNEL_FIRST = spaces.Box(0, 255, (3, 8, 6), np.uint8)
@@ -187,6 +189,26 @@ def test_other_spaces_than_the_learners(tmp_path, observation_space, action_spac
     write_dataset(tmp_path / "a.h5")
     with pytest.raises(DatasetError, match=message):
         OfflineReplayBuffer(tmp_path / "a.h5", observation_space, action_space, "cpu")
+
+
+def test_action_spaces_of_other_precision_are_the_same(tmp_path):
+    write_dataset(tmp_path / "a.h5")
+    learner = spaces.Box(ACTIONS.low.astype(np.float64), ACTIONS.high.astype(np.float64), dtype=np.float64)
+    assert learner != ACTIONS
+    assert OfflineReplayBuffer(tmp_path / "a.h5", IMAGES, learner, "cpu").sample(3).actions.dtype == th.float32
+
+
+def test_guessed_bounds_of_actions_are_to_be_given(tmp_path):
+    path, narrow = tmp_path / "d4rl.h5", spaces.Box(-0.5, 0.5, (2,))
+    with h5py.File(path, "w") as file:
+        file["observations"], file["actions"] = np.zeros((6, 3), np.float32), np.full((6, 2), 0.25, np.float32)
+        file["terminals"] = np.arange(6) == 5
+    with pytest.raises(DatasetError, match=r"action_space: is .*give OfflineDataset\(path, action_space=...\)"):
+        OfflineReplayBuffer(path, STATES, narrow, "cpu")
+    dataset = OfflineDataset(path, action_space=narrow)
+    assert (OfflineReplayBuffer(dataset, STATES, narrow, "cpu").actions == 0.5).all()
+    with pytest.raises(DatasetError, match="Use the environment"):
+        OfflineReplayBuffer(dataset, STATES, spaces.Box(-1, 1, (2,)), "cpu")
 
 
 def test_buffer_is_fixed(tmp_path):

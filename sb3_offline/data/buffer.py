@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
-from sb3_offline.data.spaces import subspaces
+from sb3_offline.data.spaces import same_actions, subspaces
 from sb3_offline.data.storage import RowStore, observation_stores
 
 STATISTICS_BYTES = 1 << 24
@@ -95,11 +95,12 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.n_steps, self.gamma, self.next_actions = n_steps, gamma, next_actions
         self.datasets = datasets
         self._transposed = _match_observations(datasets[0], observation_space)
-        if datasets[0].action_space != action_space:
+        if not same_actions(datasets[0].action_space, action_space):
             problem = f"is {datasets[0].action_space}, but the learner has {action_space}"
-            raise DatasetError(
-                datasets[0].path, "action_space", problem, "Use the environment that the data were collected in"
-            )
+            remedy = "Use the environment that the data were collected in"
+            if datasets[0].guessed_actions:
+                remedy = "A D4RL-style file declares no bounds: give OfflineDataset(path, action_space=...)"
+            raise DatasetError(datasets[0].path, "action_space", problem, remedy)
         lengths = np.concatenate([d.lengths for d in datasets])
         self._index_steps(lengths)
         self.actions = self._scaled_actions()

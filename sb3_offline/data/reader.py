@@ -117,6 +117,11 @@ class OfflineDataset:
         self.arrays = arrays
         self._check(arrays)
 
+    @property
+    def guessed_actions(self) -> bool:
+        """:return: whether the action space is a guess, since the file (D4RL) declares none and none was given"""
+        return self.storage == "memory" and self._given_spaces["action_space"] is None
+
     def _read_arrays(self, file: h5py.File, header: Header) -> tuple[int, dict[str, Any]]:
         """Map or read the committed rows of every array. A file that a killed writer left has room for more than these."""
         fields = header.fields()

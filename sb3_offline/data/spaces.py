@@ -83,6 +83,14 @@ def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
     return {name: space}
 
 
+def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
+    """:return: whether two action spaces are the same, floats of either precision: files hold float32 in any case"""
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box) and space.dtype.kind == other.dtype.kind == "f":
+        one, two = (np.array([box.low, box.high], np.float32) for box in (space, other))
+        return np.array_equal(one, two)
+    return space == other
+
+
 def check_observations(
     value: Any, space: spaces.Space, rows: int | None, file: str | os.PathLike, name: str = "observations"
 ) -> dict[str, np.ndarray]:
