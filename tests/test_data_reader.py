@@ -163,7 +163,7 @@ def test_d4rl_file_with_next_observations(tmp_path):
 def test_d4rl_file_without_next_observations(tmp_path):
     write_arrays(tmp_path / "d.hdf5", d4rl_arrays())
     dataset = OfflineDataset(tmp_path / "d.hdf5")
-    # The observations after steps 7 and 9 are unknown: these steps are left out; that after step 3 is never used
+    # The observations after steps 7 and 9 are unknown: these steps are left out; that after step 3 repeats the last one
     assert dataset.lengths.tolist() == [4, 3, 1]
     assert dataset.observations[:, 0].tolist() == [0, 1, 2, 3, 3, 4, 5, 6, 7, 8, 9]
     assert dataset.rewards.tolist() == [0, 1, 2, 3, 4, 5, 6, 8]

@@ -29,7 +29,8 @@ def read_d4rl(
     Read a D4RL-style file into memory, as the arrays of our format.
 
     Such a file has one observation per step. Where it has no ``next_observations``, the observation after the last step of an
-    episode is unknown. A terminated episode repeats its last observation there (its value never counts); any other
+    episode is unknown. A terminated episode repeats its last observation there: learners that stop at ``terminated`` never use
+    it, but to those that ignore it, as learners from success examples do, the last step seems to change nothing. Any other
     episode ends one step earlier instead, as in D4RL's own ``qlearning_dataset``.
 
     :param file: the open file
