@@ -70,7 +70,7 @@ def test_samples_are_those_of_a_slow_loop(tmp_path, n_steps, next_actions, stora
     buffer = OfflineReplayBuffer(str(tmp_path / "*.h5"), STATES, ACTIONS, "cpu", **options)
     expected = transitions_by_slow_loop(episodes, n_steps, next_actions)
     assert buffer.size() == len(expected)
-    samples = buffer._get_samples(np.arange(buffer.size()))
+    samples = buffer.transitions(np.arange(buffer.size()))
     for name, values in samples._asdict().items():
         if values is None:
             assert (n_steps == 1 and name.startswith("nstep")) or (not next_actions and name.endswith("_actions"))
@@ -83,7 +83,7 @@ def test_samples_are_those_of_a_slow_loop(tmp_path, n_steps, next_actions, stora
 def test_every_step_is_drawn_equally_often(tmp_path):
     write_dataset(tmp_path / "a.h5", 6, STATES)
     buffer = OfflineReplayBuffer(tmp_path / "a.h5", STATES, ACTIONS, "cpu", next_actions=True, seed=0)
-    all_steps = buffer._get_samples(np.arange(buffer.size())).observations.numpy()
+    all_steps = buffer.transitions(np.arange(buffer.size())).observations.numpy()
     drawn = buffer.sample(20_000).observations.numpy()
     counts = (drawn[:, None, 0] == all_steps[None, :, 0]).sum(axis=0)
     expected = 20_000 / buffer.size()
@@ -131,7 +131,7 @@ def test_dict_observations(tmp_path):
     episodes = write_dataset(tmp_path / "a.h5", space=BOTH)
     learner = spaces.Dict({"image": CHANNEL_FIRST, "state": STATES})
     buffer = OfflineReplayBuffer(tmp_path / "a.h5", learner, ACTIONS, "cpu", n_steps=2, storage="mmap")
-    samples = buffer._get_samples(np.arange(len(episodes[0]["actions"])))
+    samples = buffer.transitions(np.arange(len(episodes[0]["actions"])))
     for key, part in episodes[0]["observations"].items():
         wanted = part.transpose(0, 3, 1, 2) if key == "image" else part
         np.testing.assert_array_equal(samples.observations[key], wanted[:-1])
@@ -237,7 +237,7 @@ def test_stock_sac_trains_on_it_through_vec_normalize(tmp_path):
     vec_env = VecNormalize(DummyVecEnv([lambda: env]))
     moments = vec_env.obs_rms
     moments.mean, moments.var, moments.count = buffer.observation_statistics()
-    everything = buffer._get_samples(np.arange(60), env=vec_env)
+    everything = buffer.transitions(np.arange(60), env=vec_env)
     assert abs(everything.observations.mean()) < 0.1 and abs(everything.observations.std() - 1) < 0.1
     model = SAC("MlpPolicy", vec_env, buffer_size=1, policy_kwargs={"net_arch": [8]}, device="cpu")
     model.set_logger(configure(None, []))

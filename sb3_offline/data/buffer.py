@@ -166,27 +166,30 @@ class OfflineReplayBuffer(ReplayBuffer):
         :param env: normalises observations and rewards
         :return: steps drawn uniformly, with replacement
         """
-        return self._get_samples(self.rng.integers(0, self.buffer_size, batch_size), env)
+        return self.transitions(self.rng.integers(0, self.buffer_size, batch_size), env)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
+        return self.transitions(batch_inds, env)  # the name that SB3 knows
+
+    def transitions(self, steps: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:
         """
-        :param batch_inds: (B,) step numbers, counted through all files
+        :param steps: (B,) step numbers below ``size()``, counted through all files in their order
         :param env: normalises observations and rewards
-        :return: these transitions
+        :return: these transitions, in this order
         """
-        rows = self._observation_rows[batch_inds]
-        one = np.minimum(1, self._steps_left[batch_inds])
+        rows = self._observation_rows[steps]
+        one = np.minimum(1, self._steps_left[steps])
         samples = OfflineSamples(
             observations=self._observations(rows, env),
-            actions=self._to_device(self.actions.take(batch_inds, axis=0)),
+            actions=self._to_device(self.actions.take(steps, axis=0)),
             next_observations=self._observations(rows + one, env),
-            dones=self._column(self.dones[batch_inds]),
-            rewards=self._column(self._normalize_reward(self.rewards[batch_inds], env)),
+            dones=self._column(self.dones[steps]),
+            rewards=self._column(self._normalize_reward(self.rewards[steps], env)),
             discounts=self._column(np.full(len(batch_inds), self.gamma)),
         )
         if self.next_actions:
-            samples = samples._replace(next_actions=self._to_device(self.actions.take(batch_inds + one, axis=0)))
-        return samples._replace(**self._windows(batch_inds, rows, env)) if self.n_steps > 1 else samples
+            samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
+        return samples._replace(**self._windows(steps, rows, env)) if self.n_steps > 1 else samples
 
     def _windows(self, steps: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         ahead = np.minimum(self.n_steps, self._steps_left[steps])
