@@ -185,7 +185,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             next_observations=self._observations(rows + one, env),
             dones=self._column(self.dones[steps]),
             rewards=self._column(self._normalize_reward(self.rewards[steps], env)),
-            discounts=self._column(np.full(len(batch_inds), self.gamma)),
+            discounts=self._column(np.full(len(steps), self.gamma)),
         )
         if self.next_actions:
             samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
