@@ -39,7 +39,7 @@ def judge_trajectories(model: CEBORL, dataset: OfflineDataset) -> JudgedTrajecto
     buffer = OfflineReplayBuffer(dataset, model.observation_space, model.action_space, device=model.device)
     batches = []
     for steps in np.array_split(np.arange(buffer.size()), max(buffer.size() // 512, 1)):
-        samples = buffer._get_samples(steps)
+        samples = buffer.transitions(steps)
         logits = model.critic.values(model.critic.encode(samples.observations), samples.actions)
         batches.append(logits.amin(dim=0).exp().cpu().numpy())
     shape = (dataset.n_episodes, int(dataset.lengths[0]))
