@@ -23,6 +23,9 @@ class _ReportProgress(BaseCallback):
         self.reports, self.label = reports, label
 
     def _on_step(self) -> bool:
+        parent = multiprocessing.parent_process()
+        if parent is not None and not parent.is_alive():
+            raise SystemExit("the process that asked for this run is gone")
         if self.num_timesteps % REPORT_INTERVAL == 0:
             self.reports.put((self.label, self.num_timesteps))
         return True
