@@ -2,6 +2,7 @@
 
 import csv
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -9,7 +10,8 @@ from sb3_offline import cli
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.demo.pipeline import METHODS, DemoSettings, run_demo
 from sb3_offline.experiment.config import load_config, parse_overrides
-from sb3_offline.experiment.evaluation import success_interval
+from sb3_offline.experiment.evaluation import evaluate_success, success_interval
+from sb3_offline.experiment.recording import record_gif
 
 TINY = DemoSettings(
     episodes_per_task=6,
@@ -116,3 +118,25 @@ def test_success_interval_is_wilsons():
     low, high = success_interval(8, 10)
     assert (low, high) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
     assert success_interval(0, 20)[0] == 0.0 and 0.15 < success_interval(0, 20)[1] < 0.17
+
+
+class Still:
+    """Does nothing, and keeps the first observation of each episode."""
+
+    def __init__(self, action_shape):
+        self.action, self.starts, self.n = np.zeros(action_shape, np.float32), [], 0
+
+    def predict(self, observation, *_, **__):
+        if self.n % 5 == 0:
+            self.starts.append(observation.flatten())
+        self.n += 1
+        return self.action, None
+
+
+def test_recorded_episodes_are_those_of_the_evaluation(tmp_path):
+    env_kwargs = {"task": "door-open", "obs_type": "state", "episode_length": 5}
+    evaluated, recorded = Still((1, 4)), Still(4)
+    evaluate_success(evaluated, "MultimodalMetaworld-v0", env_kwargs, 2)
+    record_gif(recorded, "MultimodalMetaworld-v0", env_kwargs, tmp_path / "still.gif", n_episodes=2, size=16)
+    np.testing.assert_array_equal(evaluated.starts, recorded.starts)
+    assert not np.array_equal(*evaluated.starts)
