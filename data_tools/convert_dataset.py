@@ -16,14 +16,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
     convert(args.source, args.destination, args.storage, overwrite=args.overwrite)
-
-
-def main(argv: list[str] | None = None) -> None:
-    """:param argv: the command line, default ``sys.argv``"""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_arguments(parser)
-    run(parser.parse_args(argv))
-
-
-if __name__ == "__main__":
-    main()

@@ -91,14 +91,3 @@ def run(args: argparse.Namespace) -> None:
     save_examples(args.output, examples, datasets[0].observation_space, provenance)
     n_episodes = sum(len(origin["episodes"]) for origin in provenance["datasets"])
     print(f"{args.count} examples from {n_episodes} episodes -> {args.output}")
-
-
-def main(argv: list[str] | None = None) -> None:
-    """:param argv: the command line, default ``sys.argv``"""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_arguments(parser)
-    run(parser.parse_args(argv))
-
-
-if __name__ == "__main__":
-    main()

@@ -246,14 +246,3 @@ def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
     summaries = inspect_datasets(args.dataset)
     print(json.dumps(summaries, indent=2) if args.json else "\n\n".join(map(format_summary, summaries)))
-
-
-def main(argv: list[str] | None = None) -> None:
-    """:param argv: the command line, default ``sys.argv``"""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_arguments(parser)
-    run(parser.parse_args(argv))
-
-
-if __name__ == "__main__":
-    main()

@@ -6,11 +6,12 @@ import pytest
 from data_files import ACTIONS, BOTH, IMAGES, STATES, write_dataset
 from gymnasium import spaces
 
+from sb3_offline import cli
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
-from sb3_offline.data_tools import convert_dataset, inspect_dataset
+from sb3_offline.data_tools import inspect_dataset
 from sb3_offline.data_tools.inspect_dataset import format_summary
 
 
@@ -19,7 +20,7 @@ def test_to_compressed_and_back_loses_nothing(tmp_path, space):
     original, small, back = (tmp_path / name for name in ("a.h5", "small.h5", "back.h5"))
     write_dataset(original, 30, space, env_id="Some-v0", env_kwargs={"task": "x"}, provenance={"seed": 3})
     convert(original, small, "compressed", progress_bar=False)
-    convert_dataset.main([str(small), str(back), "--storage", "contiguous"])
+    cli.main(["convert", str(small), str(back), "--storage", "contiguous"])
     first, middle, last = map(OfflineDataset, (original, small, back))
     assert [dataset.storage for dataset in (first, middle, last)] == ["contiguous", "compressed", "contiguous"]
     for other in (middle, last):
@@ -66,7 +67,7 @@ def test_an_interrupted_conversion_leaves_nothing(tmp_path, monkeypatch):
 
 def test_summary_of_a_sound_file(tmp_path, capsys):
     episodes = write_dataset(tmp_path / "a.h5", 30, env_id="Some-v0", provenance={"policy": "random"})
-    inspect_dataset.main(["--json", str(tmp_path / "a.h5")])
+    cli.main(["inspect", "--json", str(tmp_path / "a.h5")])
     (summary,) = json.loads(capsys.readouterr().out)
     left = [episode for episode in episodes if episode["source"] == "left"]
     group = summary["groups"]["left"]
