@@ -7,11 +7,11 @@ from data_files import BOTH, IMAGES, STATES, make_observations, write_dataset
 from gymnasium import spaces
 from PIL import Image
 
+from sb3_offline import cli
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import load_examples, save_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools import extract_examples as extract_program
 from sb3_offline.data_tools.extract_examples import extract_examples
 
 CHANNEL_FIRST = spaces.Box(0, 255, (3, 8, 6), np.uint8)
@@ -149,12 +149,12 @@ def test_extraction_is_seeded_and_does_not_depend_on_storage(tmp_path):
 
 def test_extraction_program(tmp_path, capsys):
     write_dataset(tmp_path / "a.h5", 30)
-    command = [str(tmp_path / "a.h5"), "-o", str(tmp_path / "e.h5"), "-n", "7", "--held-out"]
-    extract_program.main(command)
+    command = ["examples", str(tmp_path / "a.h5"), "-o", str(tmp_path / "e.h5"), "-n", "7", "--held-out"]
+    cli.main(command)
     assert "7 examples from" in capsys.readouterr().out
     examples, provenance = extract_examples(OfflineDataset(tmp_path / "a.h5"), 7, held_out=True)
     np.testing.assert_array_equal(load_examples(tmp_path / "e.h5", IMAGES), examples)
     with h5py.File(tmp_path / "e.h5") as file:
         assert json.loads(file.attrs["provenance"]) == provenance
-    with pytest.raises(DatasetError, match=r"exists already. Give --overwrite"):
-        extract_program.main(command)
+    with pytest.raises(SystemExit, match=r"exists already. Give --overwrite"):
+        cli.main(command)
