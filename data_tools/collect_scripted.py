@@ -67,7 +67,7 @@ class ScriptedEpisode:
     :param actions: (T, 4) float32
     :param task_success: (T, 5) bool, after each decision
     :param task_reward: (T, 5) float32
-    :param scene_state: (T, 30) float32, `TableScene.get_state` after each decision, to draw it again
+    :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision, to draw it again: rounded, frames would differ
     """
 
     task: str
@@ -139,7 +139,7 @@ def _run_episode(env: gym.Env, task: str, seed: int) -> ScriptedEpisode:
         actions.append(action)
         successes.append(info["task_success"])
         rewards.append(info["task_reward"])
-        states.append(scene_env.scene.get_state().astype(np.float32))
+        states.append(scene_env.scene.get_state())
     return ScriptedEpisode(task, seed, *map(np.stack, (observations, actions, successes, rewards, states)))
 
 
@@ -248,7 +248,7 @@ def collect_scripted(
         provenance=provenance,
         mode=mode,
         rewards=False,
-        extras={"task_success": ((5,), "bool"), "task_reward": ((5,), "float32"), "scene_state": ((30,), "float32")},
+        extras={"task_success": ((5,), "bool"), "task_reward": ((5,), "float32"), "scene_state": ((30,), "float64")},
         sources=list(tasks),
         capacity=(n_episodes, n_steps),
     ) as writer:
