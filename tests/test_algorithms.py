@@ -12,6 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_offline import ALGOS, RCE
+from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.common.torch_layers import StandardizedExtractor
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
@@ -69,9 +70,13 @@ def files(tmp_path_factory):
     return result
 
 
+def needs_examples(algo):
+    return issubclass(ALGOS[algo], ExampleBasedAlgorithm)
+
+
 def make(algo, policy, files, env=None, **kwargs):
     dataset, examples = files[policy]
-    if algo != "bc":
+    if needs_examples(algo):
         kwargs = {"examples": examples, "example_batch_size": 4, **kwargs}
     small = {"net_arch": [16, 16]}
     if policy == "CnnPolicy":
@@ -102,10 +107,23 @@ def test_learn_predict_save_load_go_on(algo, policy, files, tmp_path):
     model.save(tmp_path / "model")
     loaded = ALGOS[algo].load(tmp_path / "model")  # no dataset, no environment: good for prediction
     np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
-    kwargs = {} if algo == "bc" else {"examples": files[policy][1]}
+    kwargs = {"examples": files[policy][1]} if needs_examples(algo) else {}
     again = ALGOS[algo].load(tmp_path / "model", env=ForbiddenEnv(space), **kwargs)
     again.learn(2, reset_num_timesteps=False)
     assert again.num_timesteps == again._n_updates == 5
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_a_resumed_run_equals_an_uninterrupted_one(algo, files, tmp_path):
+    whole = make(algo, "MlpPolicy", files).learn(6).policy.state_dict()
+    model = make(algo, "MlpPolicy", files).learn(3)
+    model.save(tmp_path / "model")
+    kwargs = {"examples": files["MlpPolicy"][1]} if needs_examples(algo) else {}
+    resumed = ALGOS[algo].load(tmp_path / "model", **kwargs)
+    th.rand(1)  # such as an evaluation draws before the run goes on
+    resumed.learn(3, reset_num_timesteps=False)
+    for name, value in resumed.policy.state_dict().items():
+        assert th.equal(value, whole[name]), name
 
 
 @pytest.mark.parametrize(("algo", "policy"), CASES)

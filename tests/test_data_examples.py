@@ -88,6 +88,7 @@ def test_dict_and_state_examples(tmp_path):
         (FRAMES[:, :4], r"has shape \(5, 4, 6, 3\), expected \(n, 8, 6, 3\)"),
         (FRAMES[0], r"has shape \(8, 6, 3\), expected"),
         (FRAMES.astype(np.int64) + 200, "holds values in .* outside of the range"),
+        ([FRAMES[0].tolist(), FRAMES[0, :4].tolist()], "examples: is no array"),
     ],
 )
 def test_unfit_arrays(tmp_path, source, message):

@@ -108,6 +108,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.random_shift = random_shift
         self._sampler_state: dict[str, Any] | None = None
+        self._torch_rng_state: th.Tensor | None = None  # of a saved model, until it goes on learning
         self._metrics: dict[str, tuple[th.Tensor, int]] = {}
 
     def _setup_model(self) -> None:
@@ -246,6 +247,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._total_timesteps = total_timesteps
         self._num_timesteps_at_start = self.num_timesteps
         self._metrics = {}
+        if self._torch_rng_state is not None:
+            th.set_rng_state(self._torch_rng_state)
+            self._torch_rng_state = None
         if not self._custom_logger:
             self._logger = utils.configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
         return total_timesteps, self._init_callback(callback, progress_bar)
@@ -298,12 +302,16 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         if self._replay_buffer is not None:
             self._sampler_state = self._replay_buffer.get_rng_state()
+        # With these two, a loaded model goes on (on the CPU) as this one would: actions are drawn by PyTorch's generator.
+        self._torch_rng_state = th.get_rng_state()
         super().save(path, exclude, include)
+        self._torch_rng_state = None
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_replay_buffer_source", "_metrics"]
-        # An open dataset holds file maps; paths are kept, so that `load` can go on learning.
-        return [*excluded, "dataset"] if isinstance(self.dataset, OfflineDataset) else excluded
+        # An open dataset would be opened again by `load`, even to predict; paths are kept, so that it can go on learning.
+        parts = self.dataset if isinstance(self.dataset, list | tuple) else [self.dataset]
+        return [*excluded, "dataset"] if any(isinstance(part, OfflineDataset) for part in parts) else excluded
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer"], []

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import open_hdf5, replacing
-from sb3_offline.data.spaces import check_observations, space_to_json
+from sb3_offline.data.spaces import check_observations, space_to_json, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
 EXAMPLES_VERSION = 1
@@ -48,9 +48,12 @@ def load_examples(
             value = _read_hdf5(path)
     if isinstance(value, Mapping) and isinstance(observation_space, spaces.Dict):
         plain = observation_space.spaces
-        value = {key: _match_layout(np.asarray(part), plain[key]) if key in plain else part for key, part in value.items()}
+        value = {
+            key: _match_layout(to_array(part, file, f"examples/{key}"), plain[key]) if key in plain else part
+            for key, part in value.items()
+        }
     elif not isinstance(value, Mapping):
-        value = _match_layout(np.asarray(value), observation_space)
+        value = _match_layout(to_array(value, file, "examples"), observation_space)
     arrays = check_observations(value, observation_space, None, file, "examples")
     n = len(next(iter(arrays.values())))
     for name, array in arrays.items():
