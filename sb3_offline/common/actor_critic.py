@@ -1,0 +1,47 @@
+"""What all algorithms with an actor and critics share."""
+
+from typing import ClassVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import get_parameters_by_name
+
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, OfflineActor, OfflineCritic, OfflinePolicy
+
+
+class ActorCriticAlgorithm(OfflineAlgorithm):
+    """
+    The base for algorithms with an actor, critics and target critics.
+
+    :param args: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: OfflinePolicy
+    actor: OfflineActor
+    critic: OfflineCritic
+    critic_target: OfflineCritic
+
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+
+    def _policy_features(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
+        """The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own."""
+        return features.detach() if self.policy.share_features_extractor else self.actor.encode(observations)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []
