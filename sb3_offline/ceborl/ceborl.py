@@ -1,12 +1,11 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 import math
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name
 
 from sb3_offline.ceborl.losses import (
     advantage_weights,
@@ -15,9 +14,7 @@ from sb3_offline.ceborl.losses import (
     recursive_loss,
     success_odds,
 )
-from sb3_offline.ceborl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
-from sb3_offline.common.policies import OfflineActor, OfflineCritic, OfflinePolicy
 from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.reader import DatasetSource
 
@@ -98,16 +95,6 @@ class CEBORL(ExampleBasedAlgorithm):
     :param device: Device (cpu, cuda, ...) on which the code should be run.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
-    policy: OfflinePolicy
-    actor: OfflineActor
-    critic: OfflineCritic
-    critic_target: OfflineCritic
 
     def __init__(
         self,
@@ -196,13 +183,6 @@ class CEBORL(ExampleBasedAlgorithm):
             self.policy_kwargs.setdefault("std_min", 0.05)
         super()._setup_model()
 
-    def _create_aliases(self) -> None:
-        super()._create_aliases()
-        self.critic = self.policy.critic
-        self.critic_target = self.policy.critic_target
-        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
-        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
-
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
@@ -266,10 +246,6 @@ class CEBORL(ExampleBasedAlgorithm):
             )
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._record_diagnostics(features, policy_features, discounted_omega / self.gamma)
-
-    def _policy_features(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
-        """The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own."""
-        return features.detach() if self.policy.share_features_extractor else self.actor.encode(observations)
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         """
@@ -336,9 +312,3 @@ class CEBORL(ExampleBasedAlgorithm):
             omega_p50=p50,
             omega_p99=p99,
         )
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "actor.optimizer", "critic.optimizer"], []

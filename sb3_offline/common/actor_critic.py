@@ -5,7 +5,7 @@ from typing import ClassVar
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import get_parameters_by_name
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, OfflineActor, OfflineCritic, OfflinePolicy
@@ -28,6 +28,8 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
     actor: OfflineActor
     critic: OfflineCritic
     critic_target: OfflineCritic
+    batch_norm_stats: list[th.Tensor]
+    batch_norm_stats_target: list[th.Tensor]
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -39,6 +41,12 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
     def _policy_features(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
         """The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own."""
         return features.detach() if self.policy.share_features_extractor else self.actor.encode(observations)
+
+    def _update_target(self) -> None:
+        if self._n_updates % self.target_update_interval == 0:
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            # Running statistics of batch normalisation are copied, as in SB3's SAC.
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"]

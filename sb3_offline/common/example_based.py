@@ -9,14 +9,14 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
-from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import DatasetSource
 
 ExampleSource = str | PathLike | np.ndarray | dict[str, np.ndarray]
 
 
-class ExampleBasedAlgorithm(OfflineAlgorithm):
+class ExampleBasedAlgorithm(ActorCriticAlgorithm):
     """
     The base for algorithms that are given observations of a completed task, S*, beside the unlabelled dataset.
 

@@ -12,7 +12,6 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Pr
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
-from stable_baselines3.common.utils import polyak_update
 
 from sb3_offline.common.augmentation import shift_observations
 from sb3_offline.common.stub_env import SpacesOnlyEnv
@@ -55,11 +54,6 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     needs_next_actions: bool = False
     _replay_buffer: Any
     _replay_buffer_source: Any
-    # Of the actor-critic algorithms:
-    critic: th.nn.Module
-    critic_target: th.nn.Module
-    batch_norm_stats: list[th.Tensor]
-    batch_norm_stats_target: list[th.Tensor]
 
     def __init__(
         self,
@@ -269,12 +263,6 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-
-    def _update_target(self) -> None:
-        if self._n_updates % self.target_update_interval == 0:
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            # Running statistics of batch normalisation are copied, as in SB3's SAC.
-            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     # --------------------------------------------------------------- logging
 
