@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import functools
 import importlib.metadata
-import multiprocessing
 import os
 import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -23,6 +21,7 @@ from tqdm.auto import tqdm
 
 import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
 ENV_ID = "MultimodalMetaworld-v0"
@@ -67,7 +66,7 @@ class ScriptedEpisode:
     :param actions: (T, 4) float32
     :param task_success: (T, 5) bool, after each decision
     :param task_reward: (T, 5) float32
-    :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision, to draw it again: rounded, frames would differ
+    :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision, to draw it again to the byte
     """
 
     task: str
@@ -156,11 +155,6 @@ def _episode_in_worker(obs_type: str, job: tuple[str, int]) -> ScriptedEpisode:
         return _run_episode(_shared_env(obs_type), *job)
 
 
-def _prepare_worker() -> None:
-    # Software rendering and BLAS each start a thread for every core otherwise.
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-
-
 def _check_tasks(tasks: Sequence[str]) -> None:
     unknown = set(tasks) - set(TASKS)
     if unknown:
@@ -189,15 +183,7 @@ def scripted_episodes(
     seeds = np.random.SeedSequence(seed).generate_state(episodes_per_task * len(tasks))
     jobs = [(tasks[i % len(tasks)], int(episode_seed)) for i, episode_seed in enumerate(seeds)]
     run = functools.partial(_episode_in_worker, obs_type)
-    if n_workers <= 1:
-        yield from map(run, jobs)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(n_workers, mp_context=context, initializer=_prepare_worker) as pool:
-        try:
-            yield from pool.map(run, jobs, chunksize=4)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    yield from map_in_order(run, jobs, n_workers)
 
 
 def collect_scripted(
