@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline.envs.multimodal_metaworld.rendering import FRAME_SIZE, SceneRenderer
+from sb3_offline.envs.multimodal_metaworld.rendering import CAMERA, FRAME_SIZE, SceneRenderer
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS, JITTER, TableScene
 from sb3_offline.envs.multimodal_metaworld.tasks import TASKS, make_tasks
 
@@ -32,12 +33,15 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     of the state at the end. An episode never terminates and is truncated after `episode_length` decisions.
 
     :param task: one of `TASKS`
-    :param obs_type: "pixels" for (64, 64, 3) uint8 frames, "state" for the vector `STATE_NAMES` (float32)
+    :param obs_type: "pixels" for (frame_size, frame_size, 3) uint8 frames, "state" for the vector `STATE_NAMES` (float32)
     :param render_mode: "rgb_array" or None
     :param episode_length: decisions in an episode
     :param action_repeat: control steps of 12.5 ms in a decision
-    :param width: of the pictures of `render()`; the observation stays 64 pixels wide
+    :param width: of the pictures of `render()`, whatever the `frame_size`
     :param height: of the pictures of `render()`
+    :param frame_size: width and height of the observed frames in pixels
+    :param camera: in place of entries of `CAMERA`: `lookat` (x, y, z) and `distance` in metres, `azimuth` and `elevation` in
+        degrees
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -51,6 +55,8 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         action_repeat: int = 4,
         width: int = 480,
         height: int = 480,
+        frame_size: int = FRAME_SIZE,
+        camera: Mapping[str, Any] | None = None,
     ) -> None:
         if task not in TASKS:
             raise ValueError(f"Unknown task {task!r}; choose one of {', '.join(TASKS)}.")
@@ -58,12 +64,17 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f'Unknown obs_type {obs_type!r}; choose "pixels" or "state".')
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'Unknown render_mode {render_mode!r}; choose "rgb_array" or None.')
+        if frame_size < 1:
+            raise ValueError(f"frame_size is {frame_size}; give the width of a frame in pixels.")
+        if unknown := set(camera or {}) - set(CAMERA):
+            raise ValueError(f"Unknown entries {sorted(unknown)} of camera; choose from {', '.join(CAMERA)}.")
         self.task = task
         self.obs_type = obs_type
         self.render_mode = render_mode
         self.episode_length = episode_length
         self.action_repeat = action_repeat
         self.width, self.height = width, height
+        self.frame_size, self.camera = frame_size, camera
         self.scene = TableScene()
         self._tasks = make_tasks(self.scene)
         self._task_index = TASKS.index(task)
@@ -74,7 +85,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space: spaces.Box
         if obs_type == "pixels":
-            self.observation_space = spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+            self.observation_space = spaces.Box(0, 255, (frame_size, frame_size, 3), np.uint8)
         else:
             # Wide enough for every reachable value, joint limits being soft.
             bound = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
@@ -154,7 +165,8 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def get_frame(self) -> np.ndarray:
         """
-        :return: (64, 64, 3) uint8 of the scene as it is: the observation of obs_type "pixels", whatever this one's is
+        :return: (frame_size, frame_size, 3) uint8 of the scene as it is: the observation of obs_type "pixels", also where this
+            environment observes states
         """
         return self._get_renderer().frame()
 
@@ -167,7 +179,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     def _get_renderer(self) -> SceneRenderer:
         # Made late: neither state observations nor the import of this module may need OpenGL.
         if self._renderer is None:
-            self._renderer = SceneRenderer(self.scene)
+            self._renderer = SceneRenderer(self.scene, self.frame_size, self.camera)
         return self._renderer
 
     def _observation(self) -> np.ndarray:

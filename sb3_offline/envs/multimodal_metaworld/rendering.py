@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import weakref
+from collections.abc import Mapping
 from ctypes.util import find_library
 from typing import Any
 
@@ -19,8 +20,8 @@ from sb3_offline.envs.multimodal_metaworld.scene import COARSE_ARM_GROUP, FINE_A
 FRAME_SIZE = 64
 _OVERSAMPLING = 2  # pixels drawn for one kept, in each direction: cheaper in software than multisampling, and as smooth
 
-# All five objects and the hand's whole workspace, from where the arm hides least.
-_CAMERA = {"lookat": (0.08, 0.68, 0.1), "distance": 1.45, "azimuth": 170.0, "elevation": -50.0}
+CAMERA: dict[str, Any] = {"lookat": (0.08, 0.68, 0.1), "distance": 1.45, "azimuth": 170.0, "elevation": -50.0}
+"""All five objects and the hand's whole workspace, from where the arm hides least (metres and degrees)."""
 
 _HELP = """Rendering without a screen needs OpenGL. Install one of these (Debian and Ubuntu packages):
     apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri
@@ -74,12 +75,15 @@ class SceneRenderer:
     Draws one scene. Owns an OpenGL context; `close` frees it.
 
     :param scene: what to draw
+    :param frame_size: width and height of a frame in pixels
+    :param camera: in place of entries of `CAMERA`
     """
 
-    def __init__(self, scene: TableScene) -> None:
+    def __init__(self, scene: TableScene, frame_size: int = FRAME_SIZE, camera: Mapping[str, Any] | None = None) -> None:
         self._scene = scene
         self._closed = False
-        size = FRAME_SIZE * _OVERSAMPLING
+        self._frame_size = frame_size
+        size = frame_size * _OVERSAMPLING
         self._gl = _make_gl_context(size, size)
         visual = scene.model.vis
         visual.quality.offsamples = 0
@@ -93,7 +97,7 @@ class SceneRenderer:
         self._options.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        for name, value in _CAMERA.items():
+        for name, value in {**CAMERA, **(camera or {})}.items():
             setattr(self._camera, name, value)
         _open_renderers.add(self)
         # Again with each context: it has to run before MuJoCo's own handler, which takes the display away at exit.
@@ -102,9 +106,9 @@ class SceneRenderer:
 
     def frame(self) -> np.ndarray:
         """
-        :return: (64, 64, 3) uint8, what a policy sees
+        :return: (frame_size, frame_size, 3) uint8, what a policy sees
         """
-        return self._draw(FRAME_SIZE, FRAME_SIZE, fine=False)
+        return self._draw(self._frame_size, self._frame_size, fine=False)
 
     def picture(self, width: int, height: int) -> np.ndarray:
         """
@@ -113,6 +117,15 @@ class SceneRenderer:
         :return: (height, width, 3) uint8 of the same view, with the arm's fine meshes and shadows
         """
         return self._draw(width, height, fine=True)
+
+    def device(self) -> str:
+        """
+        :return: what draws here, as OpenGL names it: other devices give slightly other pixels
+        """
+        from OpenGL import GL  # only now: the backend has been chosen
+
+        self._gl.make_current()
+        return GL.glGetString(GL.GL_RENDERER).decode()
 
     def _draw(self, width: int, height: int, *, fine: bool) -> np.ndarray:
         self._gl.make_current()

@@ -215,6 +215,15 @@ class TableScene:
         """
         return np.concatenate((self.data.qpos, self.data.mocap_pos[0], self.model.body_pos[self._body_ids, :2].ravel()))
 
+    def initial_state(self, state: np.ndarray) -> np.ndarray:
+        """
+        :param state: (30,) float, of any moment of an episode
+        :return: (30,) float64, of that episode's start: the arm and every joint as after `reset`, the bodies where they are
+        """
+        joints = np.zeros(self.model.nq)
+        joints[:N_ARM_JOINTS] = self._arm_qpos
+        return np.concatenate((joints, INITIAL_HAND_POSITION, state[self.model.nq + 3 :]))
+
     def set_state(self, state: np.ndarray) -> None:
         """
         :param state: (30,) float, what `get_state` returned; velocities become 0
