@@ -6,13 +6,16 @@ TORCH ?= torch==2.13.0
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo demo-pixels test test-slow pytest lint type format check-codestyle commit-checks doc clean
+.PHONY: demo demo-pixels states-table test test-slow pytest lint type format check-codestyle commit-checks doc clean
 
 demo: $(READY)  ## the main job: collect, train CEBORL, evaluate, report into demo/ (about 15 minutes)
 	$(BIN)/sb3-offline demo --output demo
 
 demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (about half an hour)
 	$(BIN)/sb3-offline demo --obs-type pixels --output demo-pixels
+
+states-table: $(READY)  ## all methods on all tasks from states, three seeds, into results/ceborl_states.csv (hours)
+	$(BIN)/python benchmarks/states_table.py
 
 test: $(READY)  ## all fast tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile

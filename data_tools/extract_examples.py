@@ -10,6 +10,7 @@ from gymnasium import spaces
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import Observations, save_examples
 from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.selection import of_source
 
 
 def extract_examples(
@@ -59,9 +60,7 @@ def _success_steps(dataset: OfflineDataset, source: str | None) -> np.ndarray:
         raise DatasetError(dataset.path, "success", "is missing: the file has no success labels", remedy)
     wanted = np.asarray(dataset.success)
     if source is not None:
-        if source not in dataset.sources or dataset.source is None:
-            raise DatasetError(dataset.path, "source", f"has no {source!r}", f"Its sources are {dataset.sources}")
-        wanted = wanted & np.repeat(dataset.source == dataset.sources.index(source), dataset.lengths)
+        wanted = wanted & np.repeat(of_source(dataset, source), dataset.lengths)
     return np.flatnonzero(wanted)
 
 

@@ -70,13 +70,14 @@ class OfflineDataset:
       an ``HDF5Array`` in compressed storage. ``extras``: likewise, (N, ...) by name
     - ``actions`` ``(N, *shape)`` float32 in environment units, ``rewards`` (N,) float32 or ``None``, ``terminated``,
       ``truncated`` (N,) bool, ``success`` (N,) bool or ``None``
-    - ``storage``: "contiguous", "compressed", or "memory" (D4RL)
+    - ``storage``: "contiguous", "compressed", or "memory" (D4RL, or chosen episodes)
 
-    It pickles as its path.
+    It pickles as its path and what was chosen.
 
     :param path: the file
     :param observation_space: space of a D4RL-style file, which declares none (default: unbounded, from the data)
     :param action_space: likewise (default: [-1, 1])
+    :param episodes: numbers of the episodes to hold, as if the file had no others; they are read into memory
     """
 
     def __init__(
@@ -85,11 +86,17 @@ class OfflineDataset:
         *,
         observation_space: spaces.Space | None = None,
         action_space: spaces.Space | None = None,
+        episodes: Sequence[int] | np.ndarray | None = None,
     ):
         self.path = Path(path).absolute()
-        self._given_spaces = {"observation_space": observation_space, "action_space": action_space}
+        self._options: dict[str, Any] = {
+            "observation_space": observation_space,
+            "action_space": action_space,
+            "episodes": episodes,
+        }
         with open_hdf5(self.path) as file:
-            if is_d4rl(file):
+            self._declares_spaces = not is_d4rl(file)
+            if not self._declares_spaces:
                 header, arrays = read_d4rl(file, self.path, observation_space, action_space)
                 self.storage: Storage | str = "memory"
                 n_episodes = len(arrays["episodes/length"])
@@ -97,6 +104,9 @@ class OfflineDataset:
                 header = read_header(file, self.path)
                 n_episodes, arrays = self._read_arrays(file, header)
                 self.storage = "contiguous" if file["actions"].chunks is None else "compressed"
+        if episodes is not None:
+            arrays = _chosen_rows(arrays, np.asarray(episodes, dtype=np.int64))
+            n_episodes, self.storage = len(episodes), "memory"
         self.header = header
         self.observation_space, self.action_space = header.observation_space, header.action_space
         self.env_id, self.env_kwargs, self.provenance = header.env_id, header.env_kwargs, header.provenance
@@ -120,7 +130,16 @@ class OfflineDataset:
     @property
     def guessed_actions(self) -> bool:
         """:return: whether the action space is a guess, since the file (D4RL) declares none and none was given"""
-        return self.storage == "memory" and self._given_spaces["action_space"] is None
+        return not self._declares_spaces and self._options["action_space"] is None
+
+    def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
+        """
+        :param episodes: numbers of episodes of this dataset
+        :return: the same file with these alone, in this order, read into memory
+        """
+        given = self._options["episodes"]
+        numbers = np.asarray(episodes, dtype=np.int64) if given is None else np.asarray(given)[episodes]
+        return OfflineDataset(self.path, **{**self._options, "episodes": numbers})
 
     def _read_arrays(self, file: h5py.File, header: Header) -> tuple[int, dict[str, Any]]:
         """Map or read the committed rows of every array. A file that a killed writer left has room for more than these."""
@@ -190,11 +209,28 @@ class OfflineDataset:
                 raise DatasetError(self.path, name, f"holds NaN or infinity, first in row {row}", remedy)
 
     def __reduce__(self) -> tuple:
-        return _reopen, (self.path, self._given_spaces)
+        return _reopen, (self.path, self._options)
 
 
-def _reopen(path: Path, given_spaces: dict[str, Any]) -> OfflineDataset:
-    return OfflineDataset(path, **given_spaces)
+def _reopen(path: Path, options: dict[str, Any]) -> OfflineDataset:
+    return OfflineDataset(path, **options)
+
+
+def _chosen_rows(arrays: dict[str, Any], episodes: np.ndarray) -> dict[str, Any]:
+    """:return: the arrays of some episodes, in this order, in memory"""
+    lengths = np.asarray(arrays["episodes/length"])
+    first_steps, first_observations = np.cumsum(lengths) - lengths, np.cumsum(lengths + 1) - (lengths + 1)
+    chosen = {}
+    for name, array in arrays.items():
+        if name.startswith("episodes/"):
+            chosen[name] = np.asarray(array)[episodes]
+            continue
+        is_observation = name.split("/")[0] == "observations"
+        starts, extra = (first_observations, 1) if is_observation else (first_steps, 0)
+        # Whole episodes as slices: scattered rows of a compressed file are slow to read
+        parts = [array[starts[e] : starts[e] + lengths[e] + extra] for e in episodes.tolist()]
+        chosen[name] = np.concatenate(parts) if parts else np.empty((0, *array.shape[1:]), array.dtype)
+    return chosen
 
 
 DatasetSource = str | os.PathLike | OfflineDataset | Sequence[str | os.PathLike | OfflineDataset]

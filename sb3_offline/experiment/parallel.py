@@ -26,7 +26,7 @@ class _ReportProgress(BaseCallback):
         parent = multiprocessing.parent_process()
         if parent is not None and not parent.is_alive():
             raise SystemExit("the process that asked for this run is gone")
-        if self.num_timesteps % REPORT_INTERVAL == 0:
+        if self.num_timesteps % REPORT_INTERVAL == 0 or self.num_timesteps == self.model._total_timesteps:
             self.reports.put((self.label, self.num_timesteps))
         return True
 
@@ -39,17 +39,18 @@ def _run(label: str, arguments: dict[str, Any], reports: Any) -> None:
     train(**arguments, progress_bar=False, callback=_ReportProgress(reports, label))
 
 
-def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> None:
+def train_in_parallel(
+    runs: Mapping[str, dict[str, Any]], n_workers: int, keep_going: bool = False
+) -> dict[str, BaseException]:
     """
     :param runs: label to the arguments of :func:`~sb3_offline.experiment.training.train`; they are started in this order
     :param n_workers: processes
+    :param keep_going: let the other runs finish where one fails; else its error is raised at once
+    :return: what went wrong, by label
     """
     context = multiprocessing.get_context("spawn")
     reports = context.Manager().Queue()
-    bars = {
-        label: tqdm(total=arguments["config"]["n_timesteps"], desc=label, unit="step", position=position)
-        for position, (label, arguments) in enumerate(runs.items())
-    }
+    bars: dict[str, tqdm] = {}
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
         futures: list[Future] = [
             pool.submit(functools.partial(_run, label, arguments, reports)) for label, arguments in runs.items()
@@ -57,24 +58,31 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
         try:
             while not all(future.done() for future in futures):
                 wait(futures, timeout=POLL_SECONDS)
-                _show(reports, bars)
+                _show(reports, bars, runs)
                 for future in futures:
-                    if future.done():
+                    if future.done() and not keep_going:
                         future.result()  # raises what went wrong in there, without waiting for the others
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()
             raise
-    for label, bar in bars.items():
-        bar.update(runs[label]["config"]["n_timesteps"] - bar.n)
+    for bar in bars.values():
         bar.close()
+    errors = {label: future.exception() for label, future in zip(runs, futures, strict=True)}
+    return {label: error for label, error in errors.items() if error is not None}
 
 
-def _show(reports: Any, bars: dict[str, tqdm]) -> None:
+def _show(reports: Any, bars: dict[str, tqdm], runs: Mapping[str, dict[str, Any]]) -> None:
+    """A bar for each run that has begun; it closes when its run is through, which makes room for the next."""
     while True:
         try:
             label, step = reports.get_nowait()
         except queue.Empty:
             return
+        total = runs[label]["config"]["n_timesteps"]
+        if label not in bars:
+            bars[label] = tqdm(total=total, desc=label, unit="step")
         bars[label].update(step - bars[label].n)
+        if step >= total:
+            bars[label].close()

@@ -1,7 +1,9 @@
 """One training run: a config, a dataset and examples become checkpoints and a table of evaluations."""
 
 import csv
+import itertools
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_offline
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
-from sb3_offline.experiment.evaluation import Evaluation, evaluate_success
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data.selection import select_episodes
+from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success
 
 EVALUATION_FIELDS = ("step", "episodes", "successes", "mean_return")
 
@@ -26,21 +30,34 @@ class EvaluationTable(BaseCallback):
     :param env_kwargs: of the environment
     :param eval_freq: gradient steps between evaluations
     :param n_episodes: episodes of each
+    :param eval_start: no evaluation at an earlier step
+    :param seeds: of the evaluations, one after the other (default: all play the same episodes)
     :param verbose: 1 prints each success rate
     """
 
-    def __init__(self, path: Path, env_id: str, env_kwargs: dict[str, Any], eval_freq: int, n_episodes: int, verbose: int = 0):
+    def __init__(
+        self,
+        path: Path,
+        env_id: str,
+        env_kwargs: dict[str, Any],
+        eval_freq: int,
+        n_episodes: int,
+        eval_start: int = 0,
+        seeds: Iterable[int] | None = None,
+        verbose: int = 0,
+    ):
         super().__init__(verbose)
         self.path, self.env_id, self.env_kwargs = path, env_id, env_kwargs
-        self.eval_freq, self.n_episodes = eval_freq, n_episodes
+        self.eval_freq, self.n_episodes, self.eval_start = eval_freq, n_episodes, eval_start
+        self.seeds = iter(seeds or itertools.repeat(EVALUATION_SEED))
 
     def _on_training_start(self) -> None:
         with self.path.open("w", newline="") as file:
             csv.writer(file).writerow(EVALUATION_FIELDS)
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.eval_freq == 0:
-            result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes)
+        if self.num_timesteps % self.eval_freq == 0 and self.num_timesteps >= self.eval_start:
+            result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes, next(self.seeds))
             with self.path.open("a", newline="") as file:
                 csv.writer(file).writerow(evaluation_row(self.num_timesteps, result))
             self.logger.record("eval/success_rate", result.success_rate)
@@ -86,7 +103,9 @@ def create_model(
     :param kwargs: further constructor arguments
     :return: a model, not trained
     """
-    arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs")}
+    arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
+    if "episodes" in config:
+        dataset = choose_data(dataset, config["episodes"], config.get("env_kwargs", {}))
     arguments.update(dataset=dataset, seed=seed, **kwargs)
     if examples is not None:
         arguments["examples"] = examples
@@ -94,6 +113,27 @@ def create_model(
         return find_algorithm(algo)(env=None, **arguments)  # type: ignore[arg-type]
     except TypeError as error:
         raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams and --examples") from error
+
+
+def choose_data(dataset: Any, episodes: dict[str, Any], env_kwargs: dict[str, Any]) -> list[OfflineDataset]:
+    """
+    :param dataset: dataset path(s)
+    :param episodes: arguments of :func:`~sb3_offline.data.selection.select_episodes`; ``{name}`` in a text stands for the
+        environment's keyword argument of that name, so that ``source: "{task}"`` serves all tasks
+    :param env_kwargs: of the environment
+    :return: the datasets with these episodes alone
+    """
+    try:
+        filled: dict[str, Any] = {
+            key: text.format(**env_kwargs) if isinstance(text, str) else text for key, text in episodes.items()
+        }
+        return select_episodes(dataset, **filled)
+    except KeyError as error:
+        raise RuntimeError(
+            f"The config's `episodes` names {error}, which the environment is not given: add it (--task)"
+        ) from error
+    except (AttributeError, TypeError) as error:
+        raise RuntimeError(f"The config's `episodes` is {episodes!r}; give it `source` and `success` ({error})") from error
 
 
 def train(
@@ -108,6 +148,8 @@ def train(
     seed: int = 0,
     eval_freq: int = 0,
     n_eval_episodes: int = 20,
+    eval_start: int = 0,
+    eval_seeds: Iterable[int] | None = None,
     progress_bar: bool = True,
     callback: BaseCallback | None = None,
     verbose: int = 0,
@@ -125,11 +167,14 @@ def train(
     :param seed: of the run
     :param eval_freq: gradient steps between evaluations (0: none)
     :param n_eval_episodes: episodes of each evaluation
+    :param eval_start: no evaluation at an earlier step
+    :param eval_seeds: of the evaluations' episodes, one after the other (default: all play the same episodes)
     :param progress_bar: whether to show one
     :param callback: one more callback
     :param verbose: 1 for info messages
     :return: the trained model
     """
+    record = run_record(algo, env_id, config, dataset=dataset, examples=examples, env_kwargs=env_kwargs, seed=seed)
     # Saturated classifiers make denormal numbers, which are many times slower.
     th.set_flush_denormal(True)
     if eval_freq:
@@ -138,20 +183,51 @@ def train(
         except gym.error.Error as error:
             raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
     output.mkdir(parents=True, exist_ok=True)
+    all_env_kwargs = record["env_kwargs"]
+    model = create_model(algo, {**config, "env_kwargs": all_env_kwargs}, dataset, examples, seed, verbose=verbose)
+    (output / "model.zip").unlink(missing_ok=True)  # of an earlier run: this one is finished when its own is there
+    (output / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    callbacks = [callback] if callback is not None else []
+    if eval_freq:
+        table = output / "evaluations.csv"
+        callbacks.append(
+            EvaluationTable(table, env_id, all_env_kwargs, eval_freq, n_eval_episodes, eval_start, eval_seeds, verbose)
+        )
+    model.learn(config["n_timesteps"], callback=callbacks, progress_bar=progress_bar)
+    model.save(output / "model.zip")
+    return model
+
+
+def run_record(
+    algo: str,
+    env_id: str,
+    config: dict[str, Any],
+    *,
+    dataset: Any,
+    examples: Any = None,
+    env_kwargs: dict[str, Any] | None = None,
+    seed: int = 0,
+    **_: Any,
+) -> dict[str, Any]:
+    """:return: what :func:`train`, with these arguments, writes into ``config.yml``"""
     all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
-    model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
     record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, "dataset": dataset}
     if examples is not None:
         record["examples"] = examples
     # Through JSON: paths and NumPy numbers become what a YAML file can hold.
-    (output / "config.yml").write_text(yaml.safe_dump(json.loads(json.dumps(record, default=str)), sort_keys=False))
-    callbacks = [callback] if callback is not None else []
-    if eval_freq:
-        table = output / "evaluations.csv"
-        callbacks.append(EvaluationTable(table, env_id, all_env_kwargs, eval_freq, n_eval_episodes, verbose))
-    model.learn(config["n_timesteps"], callback=callbacks, progress_bar=progress_bar)
-    model.save(output / "model.zip")
-    return model
+    return json.loads(json.dumps(record, default=str))
+
+
+def is_finished(output: Path, arguments: dict[str, Any]) -> bool:
+    """
+    :param output: folder of a run
+    :param arguments: of :func:`train`
+    :return: whether a run with these arguments is complete there
+    """
+    config_file = output / "config.yml"
+    if not (output / "model.zip").is_file() or not config_file.is_file():
+        return False
+    return yaml.safe_load(config_file.read_text()) == run_record(**arguments)
 
 
 def load_run(model_path: Path) -> tuple[OfflineAlgorithm, dict[str, Any]]:
