@@ -1,0 +1,183 @@
+"""
+Train stock SB3 SAC on each task of the multimodal Meta-World, from states, and keep its actors along the way.
+
+Training proceeds in slices. Each slice begins by loading what the previous one saved, with random numbers of its own, so
+that a run that was killed goes on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import functools
+import multiprocessing
+import shutil
+import subprocess
+import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
+
+import sb3_offline.envs  # noqa: F401  (registers the environment)
+from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
+from sb3_offline.envs.multimodal_metaworld import TASKS
+
+ENV_ID = "MultimodalMetaworld-v0"
+SLICE = 5_000
+"""Decisions between two evaluations: whole episodes."""
+SOLVED = 0.9
+"""Training stops when this share of evaluation episodes has been reached twice in a row."""
+EVAL_SEED = 1_000_000
+
+_BASE: dict[str, Any] = {
+    "learning_rate": 7e-4,
+    "batch_size": 256,
+    "gamma": 0.97,
+    "train_freq": 2,
+    "gradient_steps": 1,
+    "learning_starts": 2_000,
+    "buffer_size": 250_000,
+}
+SETTINGS = {
+    "base": {**_BASE, "policy_kwargs": {"net_arch": [128, 128]}},
+    "n-step": {**_BASE, "n_steps": 3, "policy_kwargs": {"net_arch": [128, 128]}},
+    "wide": {**_BASE, "gamma": 0.98, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}},
+}
+"""Arguments of SAC by name."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """:param parser: gets the options of ``run``"""
+    parser.add_argument("output", type=Path, help="folder: one per task in it, with curve.csv, policies/ and the state to go on from")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
+    parser.add_argument("--settings", choices=list(SETTINGS), default="base")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--eval-episodes", type=int, default=20, help=f"after every {SLICE:,} decisions")
+    parser.add_argument("--workers", type=int, default=1, help="processes of one thread; the result is the same for any number")
+
+
+def run(args: argparse.Namespace) -> None:
+    """:param args: what ``add_arguments`` asks for"""
+    train_slice = functools.partial(
+        _train_slice, settings=args.settings, seed=args.seed, n_eval_episodes=args.eval_episodes
+    )
+    started, rounds = time.time(), -(-args.n_timesteps // SLICE)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
+        for i in range(rounds):
+            folders = [args.output / task for task in args.tasks if not _is_done(_read_curve(args.output / task), (i + 1) * SLICE)]
+            for folder, row in zip(folders, pool.map(train_slice, folders), strict=True):
+                left = (time.time() - started) * (rounds - i - 1) / (i + 1) / 60
+                print(
+                    f"{folder.name:<12} {row['step']:>8} decisions: {row['successes']} of {row['episodes']} solved, "
+                    f"return {row['mean_return']:7.1f}; at most {left:.0f} min left",
+                    flush=True,
+                )
+
+
+def _is_done(curve: list[dict[str, Any]], step: int) -> bool:
+    """Whether training reached so many decisions, or solved the task before."""
+    solved = [int(row["successes"]) >= SOLVED * int(row["episodes"]) for row in curve]
+    return bool(curve) and (int(curve[-1]["step"]) >= step or solved[-2:] == [True, True])
+
+
+def _read_curve(folder: Path) -> list[dict[str, Any]]:
+    path = folder / "curve.csv"
+    if not path.exists():
+        return []
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -> dict[str, Any]:
+    """Train the task that the folder is named after for one more slice; the new curve.csv makes the slice count."""
+    th.set_num_threads(1)
+    th.set_flush_denormal(True)  # else, Adam's tiny moments slow the updates down
+    began = time.process_time()
+    curve = _read_curve(folder)
+    step = int(curve[-1]["step"]) if curve else 0
+    (folder / "policies").mkdir(parents=True, exist_ok=True)
+    index = TASKS.index(folder.name)
+    env = Monitor(gym.make(ENV_ID, task=folder.name, obs_type="state"))
+    slice_seed = int(np.random.SeedSequence((seed, index, step)).generate_state(1)[0] >> 1)
+    if curve:
+        state = folder / f"state_{step}"
+        model = SAC.load(state / "model.zip", env=env, device="cpu")
+        model.load_replay_buffer(state / "replay_buffer.pkl")
+        model.set_random_seed(slice_seed)
+    else:
+        arguments = {**SETTINGS[settings], "policy_kwargs": dict(SETTINGS[settings]["policy_kwargs"])}
+        arguments["policy_kwargs"]["optimizer_kwargs"] = {"fused": True}
+        model = SAC("MlpPolicy", env, seed=slice_seed, device="cpu", **arguments)
+    model.learn(SLICE, reset_num_timesteps=False)
+    step += SLICE
+
+    state_dict = {name: tensor.numpy() for name, tensor in model.actor.state_dict().items()}
+    weights = actor_weights(state_dict)
+    np.savez(folder / "policies" / f"{step:06d}.npz", **weights)
+    successes, returns = evaluate_actor(SacActor(weights), env, n_eval_episodes)
+    row = {
+        "step": step,
+        "episodes": n_eval_episodes,
+        "successes": int(successes.sum()),
+        "mean_return": round(float(returns.mean()), 1),
+        "ent_coef": round(float(model.log_ent_coef.detach().exp()), 4),  # type: ignore[union-attr]
+        "cpu_seconds": round(time.process_time() - began, 1),
+        "settings": settings,
+        "seed": seed,
+        "commit": _commit(),
+    }
+    state = folder / f"state_{step}"
+    state.mkdir(exist_ok=True)
+    model.save(state / "model.zip")
+    model.save_replay_buffer(state / "replay_buffer.pkl")
+    temporary = folder / "curve.csv.tmp"
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(row), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*curve, row])
+    temporary.replace(folder / "curve.csv")
+    for old in folder.glob("state_*"):
+        if old != state:
+            shutil.rmtree(old)
+    return row
+
+
+def evaluate_actor(
+    actor: SacActor, env: gym.Env, n_episodes: int, *, seed: int = EVAL_SEED, sample: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param actor: of the task that `env` rewards
+    :param env: with state observations
+    :param n_episodes: how many, of the seeds that begin at `seed`
+    :param sample: whether actions are sampled, rather than the most likely ones
+    :return: (n_episodes,) bool, solved at some decision; (n_episodes,) float64, sum of rewards
+    """
+    successes, returns = np.zeros(n_episodes, dtype=bool), np.zeros(n_episodes)
+    for i in range(n_episodes):
+        rng = np.random.default_rng(seed + i) if sample else None
+        observation, _ = env.reset(seed=seed + i)
+        truncated = False
+        while not truncated:
+            observation, reward, _, truncated, info = env.step(actor.act(observation, rng))
+            returns[i] += float(reward)
+        successes[i] = info["is_success"]
+    return successes, returns
+
+
+def _commit() -> str:
+    """:return: of the source tree that this is run from, "" for an installed package"""
+    with warnings.catch_warnings():
+        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+        try:
+            return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        except (OSError, subprocess.CalledProcessError):
+            return ""
