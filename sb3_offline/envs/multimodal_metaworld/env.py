@@ -74,7 +74,8 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         self.episode_length = episode_length
         self.action_repeat = action_repeat
         self.width, self.height = width, height
-        self.frame_size, self.camera = frame_size, camera
+        self.frame_size = frame_size
+        self.camera = {**CAMERA, **(camera or {})}
         self.scene = TableScene()
         self._tasks = make_tasks(self.scene)
         self._task_index = TASKS.index(task)
@@ -169,6 +170,12 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             environment observes states
         """
         return self._get_renderer().frame()
+
+    def get_render_device(self) -> str:
+        """
+        :return: what draws here, as OpenGL names it: frames are the same to the byte on the same device only
+        """
+        return self._get_renderer().device()
 
     def close(self) -> None:
         """Free the OpenGL context, if there is one."""

@@ -76,10 +76,10 @@ class SceneRenderer:
 
     :param scene: what to draw
     :param frame_size: width and height of a frame in pixels
-    :param camera: in place of entries of `CAMERA`
+    :param camera: all entries of `CAMERA`
     """
 
-    def __init__(self, scene: TableScene, frame_size: int = FRAME_SIZE, camera: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, scene: TableScene, frame_size: int = FRAME_SIZE, camera: Mapping[str, Any] = CAMERA) -> None:
         self._scene = scene
         self._closed = False
         self._frame_size = frame_size
@@ -97,7 +97,7 @@ class SceneRenderer:
         self._options.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        for name, value in {**CAMERA, **(camera or {})}.items():
+        for name, value in camera.items():
             setattr(self._camera, name, value)
         _open_renderers.add(self)
         # Again with each context: it has to run before MuJoCo's own handler, which takes the display away at exit.
@@ -120,7 +120,7 @@ class SceneRenderer:
 
     def device(self) -> str:
         """
-        :return: what draws here, as OpenGL names it: other devices give slightly other pixels
+        :return: the name that OpenGL gives to what draws here
         """
         from OpenGL import GL  # only now: the backend has been chosen
 
