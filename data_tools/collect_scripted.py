@@ -7,24 +7,27 @@ These are not the learned agents of the CEBORL paper. They stand in for them: ab
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import os
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from metaworld import policies
 from tqdm.auto import tqdm
 
-import sb3_offline.envs  # noqa: F401  (registers the environment)
-from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.data_tools.rollout import (
+    TaskEpisode,
+    add_episode,
+    check_tasks,
+    episode_writer,
+    roll_out,
+    shared_env,
+    versions,
+)
 from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
-ENV_ID = "MultimodalMetaworld-v0"
 BEHAVIOUR = "stock Meta-World scripted policies with noise, wrong aims and aborted attempts; no learned agents"
 
 
@@ -53,29 +56,6 @@ SCRIPTS = {
 # How the other attempts go.
 _FAILINGS = {"aborted": 0.55, "misaimed": 0.3, "clumsy": 0.15}
 _WORKSPACE_LOW, _WORKSPACE_HIGH = np.array([-0.45, 0.45, 0.08]), np.array([0.6, 0.85, 0.4])
-
-
-@dataclass(frozen=True)
-class ScriptedEpisode:
-    """
-    T decisions of one attempt at `task`.
-
-    :param task: what was attempted
-    :param seed: the episode's own: with the task, it determines every byte
-    :param observations: (T + 1, ...) of the environment
-    :param actions: (T, 4) float32
-    :param task_success: (T, 5) bool, after each decision
-    :param task_reward: (T, 5) float32
-    :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision, to draw it again to the byte
-    """
-
-    task: str
-    seed: int
-    observations: np.ndarray
-    actions: np.ndarray
-    task_success: np.ndarray
-    task_reward: np.ndarray
-    scene_state: np.ndarray
 
 
 class _Attempt:
@@ -121,44 +101,19 @@ class _Attempt:
         return np.clip(action + noise, -1.0, 1.0).astype(np.float32)
 
 
-def _run_episode(env: gym.Env, task: str, seed: int) -> ScriptedEpisode:
+def _episode_in_worker(obs_type: str, job: tuple[str, int]) -> TaskEpisode:
+    task, seed = job
+    env = shared_env(obs_type)
     scene_env: Any = env.unwrapped
-    index = TASKS.index(task)
-    attempt = _Attempt(task, np.random.default_rng((seed, index)))
-    observation, _ = env.reset(seed=seed)
-    observations = [observation]
-    actions: list[np.ndarray] = []
-    successes, rewards, states = [], [], []
-    solved = truncated = False
-    while not truncated:
-        action = attempt.act(len(actions), scene_env.stock_observation(task), solved)
-        observation, _, _, truncated, info = env.step(action)
-        solved = solved or bool(info["task_success"][index])
-        observations.append(observation)
-        actions.append(action)
-        successes.append(info["task_success"])
-        rewards.append(info["task_reward"])
-        states.append(scene_env.scene.get_state())
-    return ScriptedEpisode(task, seed, *map(np.stack, (observations, actions, successes, rewards, states)))
+    attempt = _Attempt(task, np.random.default_rng((seed, TASKS.index(task))))
 
+    def act(decision: int, solved: bool) -> np.ndarray:
+        return attempt.act(decision, scene_env.stock_observation(task), solved)
 
-@functools.lru_cache(maxsize=1)
-def _shared_env(obs_type: str) -> gym.Env:
-    """One environment for all episodes of a process: the tasks share their scene."""
-    return gym.make(ENV_ID, obs_type=obs_type)
-
-
-def _episode_in_worker(obs_type: str, job: tuple[str, int]) -> ScriptedEpisode:
     with warnings.catch_warnings():
         # The stock policies warn of every action that is clipped.
         warnings.filterwarnings("ignore", message="Constant")
-        return _run_episode(_shared_env(obs_type), *job)
-
-
-def _check_tasks(tasks: Sequence[str]) -> None:
-    unknown = set(tasks) - set(TASKS)
-    if unknown:
-        raise ValueError(f"Unknown tasks {sorted(unknown)}; choose from {', '.join(TASKS)}.")
+        return roll_out(env, task, seed, act)
 
 
 def scripted_episodes(
@@ -168,7 +123,7 @@ def scripted_episodes(
     obs_type: str = "state",
     seed: int = 0,
     n_workers: int = 2,
-) -> Iterator[ScriptedEpisode]:
+) -> Iterator[TaskEpisode]:
     """
     The same episodes in the same order for any number of workers, the tasks taking turns.
 
@@ -179,7 +134,7 @@ def scripted_episodes(
     :param n_workers: processes; 1 collects in this one
     :return: `episodes_per_task * len(tasks)` episodes
     """
-    _check_tasks(tasks)
+    check_tasks(tasks)
     seeds = np.random.SeedSequence(seed).generate_state(episodes_per_task * len(tasks))
     jobs = [(tasks[i % len(tasks)], int(episode_seed)) for i, episode_seed in enumerate(seeds)]
     run = functools.partial(_episode_in_worker, obs_type)
@@ -201,7 +156,7 @@ def collect_scripted(
     Collect episodes and write them to one dataset file.
 
     A step's `success` is that of the attempted task, which is the episode's `source`; the file holds no `rewards`, since those
-    of five tasks would be mixed in it. Extras: `task_success`, `task_reward` and `scene_state` of `ScriptedEpisode`.
+    of five tasks would be mixed in it. Extras: `task_success`, `task_reward` and `scene_state` of `TaskEpisode`.
 
     :param path: of the file
     :param episodes_per_task: how many attempts at each task
@@ -213,45 +168,19 @@ def collect_scripted(
     :param mode: "x" refuses an existing file, "w" replaces it
     :return: for each task the share of its episodes that succeeded at some step
     """
-    _check_tasks(tasks)
-    env = _shared_env(obs_type)
+    check_tasks(tasks)
     n_episodes = episodes_per_task * len(tasks)
-    n_steps = n_episodes * env.unwrapped.episode_length  # type: ignore[attr-defined]
     solved = dict.fromkeys(tasks, 0)
     provenance = {
         "program": "sb3_offline.data_tools.collect_scripted",
         "policy": BEHAVIOUR,
         "seed": seed,
         "episodes_per_task": episodes_per_task,
-        "versions": {name: importlib.metadata.version(name) for name in ("metaworld", "mujoco", "gymnasium", "numpy")},
+        "versions": versions(),
     }
-    with DatasetWriter(
-        path,
-        env.observation_space,
-        env.action_space,
-        env_id=ENV_ID,
-        env_kwargs={"obs_type": obs_type},
-        provenance=provenance,
-        mode=mode,
-        rewards=False,
-        extras={"task_success": ((5,), "bool"), "task_reward": ((5,), "float32"), "scene_state": ((30,), "float64")},
-        sources=list(tasks),
-        capacity=(n_episodes, n_steps),
-    ) as writer:
+    with episode_writer(path, obs_type, tasks, n_episodes, provenance, mode) as writer:
         episodes = scripted_episodes(episodes_per_task, tasks=tasks, obs_type=obs_type, seed=seed, n_workers=n_workers)
         for episode in tqdm(episodes, total=n_episodes, desc="collecting", unit="episode", disable=not progress):
-            success = episode.task_success[:, TASKS.index(episode.task)]
-            solved[episode.task] += bool(success.any())
-            writer.add_episode(
-                episode.observations,
-                episode.actions,
-                success=success,
-                extras={
-                    "task_success": episode.task_success,
-                    "task_reward": episode.task_reward,
-                    "scene_state": episode.scene_state,
-                },
-                seed=episode.seed,
-                source=episode.task,
-            )
+            solved[episode.task] += episode.solved
+            add_episode(writer, episode)
     return {task: count / episodes_per_task for task, count in solved.items()}

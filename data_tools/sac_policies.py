@@ -17,7 +17,7 @@ class SacActor:
     """
     The squashed Gaussian policy of a ``stable_baselines3.SAC("MlpPolicy", ...)`` with ReLU layers.
 
-    It computes in float64 and rounds the action to float32, so that the last bits of another machine's linear algebra get lost.
+    It computes in float64 and rounds actions to float32, so that the last bits of another machine's linear algebra get lost.
 
     :param weights: "0.weight" (n_out, n_in) and "0.bias" (n_out,) of the first layer, and so on; "mu.*", "log_std.*"
     """
@@ -25,7 +25,9 @@ class SacActor:
     def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
         n_hidden = sum(name.endswith(".weight") for name in weights) - 2
         names = [*map(str, range(n_hidden)), "mu", "log_std"]
-        layers = [(weights[f"{name}.weight"].T.astype(np.float64), weights[f"{name}.bias"].astype(np.float64)) for name in names]
+        layers = [
+            (weights[f"{name}.weight"].T.astype(np.float64), weights[f"{name}.bias"].astype(np.float64)) for name in names
+        ]
         self._hidden, self._mean, self._log_std = layers[:-2], layers[-2], layers[-1]
 
     def act(self, state: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -64,4 +66,6 @@ def load_actor(path: str | os.PathLike[str]) -> SacActor:
         with np.load(path) as weights:
             return SacActor(dict(weights))
     except (OSError, KeyError, ValueError) as error:
-        raise DatasetError(path, "weights", f"cannot be read ({error})", "Name a file written by sb3-offline train-sac") from error
+        raise DatasetError(
+            path, "weights", f"cannot be read ({error})", "Name a file written by sb3-offline train-sac"
+        ) from error

@@ -14,7 +14,6 @@ import multiprocessing
 import shutil
 import subprocess
 import time
-import warnings
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,11 +24,10 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
-import sb3_offline.envs  # noqa: F401  (registers the environment)
+from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
-ENV_ID = "MultimodalMetaworld-v0"
 SLICE = 5_000
 """Decisions between two evaluations: whole episodes."""
 SOLVED = 0.9
@@ -55,25 +53,29 @@ SETTINGS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: gets the options of ``run``"""
-    parser.add_argument("output", type=Path, help="folder: one per task in it, with curve.csv, policies/ and the state to go on from")
+    parser.add_argument(
+        "output", type=Path, help="folder: one per task in it, with curve.csv, policies/ and the state to go on from"
+    )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
     parser.add_argument("--settings", choices=list(SETTINGS), default="base")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--eval-episodes", type=int, default=20, help=f"after every {SLICE:,} decisions")
-    parser.add_argument("--workers", type=int, default=1, help="processes of one thread; the result is the same for any number")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes of one thread; the result is the same for any number"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    train_slice = functools.partial(
-        _train_slice, settings=args.settings, seed=args.seed, n_eval_episodes=args.eval_episodes
-    )
+    train_slice = functools.partial(_train_slice, settings=args.settings, seed=args.seed, n_eval_episodes=args.eval_episodes)
     started, rounds = time.time(), -(-args.n_timesteps // SLICE)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
         for i in range(rounds):
-            folders = [args.output / task for task in args.tasks if not _is_done(_read_curve(args.output / task), (i + 1) * SLICE)]
+            folders = [
+                args.output / task for task in args.tasks if not _is_done(_read_curve(args.output / task), (i + 1) * SLICE)
+            ]
             for folder, row in zip(folders, pool.map(train_slice, folders), strict=True):
                 left = (time.time() - started) * (rounds - i - 1) / (i + 1) / 60
                 print(
@@ -175,9 +177,8 @@ def evaluate_actor(
 
 def _commit() -> str:
     """:return: of the source tree that this is run from, "" for an installed package"""
-    with warnings.catch_warnings():
-        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-        try:
-            return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-        except (OSError, subprocess.CalledProcessError):
-            return ""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""

@@ -8,7 +8,7 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
-from sb3_offline.data_tools.collect_scripted import ENV_ID
+from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.demo.trajectories import JudgedTrajectories
 
 matplotlib.use("Agg")

@@ -22,6 +22,8 @@ STATE_NAMES = (
     *("puck_x", "puck_y", "puck_goal_x", "puck_goal_y"),
 )
 """What the entries of a state observation are: metres and radians, the gripper's opening in [0, 1]."""
+# Wide enough for every reachable value, joint limits being soft.
+_STATE_BOUND = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
 
 
 class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -88,9 +90,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         if obs_type == "pixels":
             self.observation_space = spaces.Box(0, 255, (frame_size, frame_size, 3), np.uint8)
         else:
-            # Wide enough for every reachable value, joint limits being soft.
-            bound = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
-            self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
+            self.observation_space = spaces.Box(-_STATE_BOUND, _STATE_BOUND, dtype=np.float32)
 
         model = self.scene.model
         self._joints = [model.joint(name).qposadr[0] for name in ("knob_Joint_1", "doorjoint", "drawer_slide", "LeverAxis")]
@@ -190,9 +190,12 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._renderer
 
     def _observation(self) -> np.ndarray:
-        return self.get_frame() if self.obs_type == "pixels" else self._state()
+        return self.get_frame() if self.obs_type == "pixels" else self.get_state()
 
-    def _state(self) -> np.ndarray:
+    def get_state(self) -> np.ndarray:
+        """
+        :return: (21,) float32 of the scene as it is: the observation of obs_type "state", whatever this one's is
+        """
         data = self.scene.data
         xpos, geoms = data.xpos, data.geom_xpos
         dial, door, drawer, lever = data.qpos[self._joints]
@@ -215,4 +218,4 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             ],
             dtype=np.float32,
         )
-        return np.clip(state, self.observation_space.low, self.observation_space.high)
+        return np.clip(state, -_STATE_BOUND, _STATE_BOUND)
