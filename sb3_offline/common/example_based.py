@@ -45,15 +45,26 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         self._example_arrays: dict[str, np.ndarray] | None = None
         self._example_source: ExampleSource | None = None
 
+    def all_examples(self) -> PyTorchObs:
+        """
+        :return: all success examples, like a batch of observations
+        """
+        return self._examples_at(slice(None))
+
     def sample_examples(self) -> PyTorchObs:
         """
         :return: ``example_batch_size`` success examples, drawn with replacement, like a batch of observations
         """
+        n_examples = len(next(iter(self._loaded_examples().values())))
+        return self._examples_at(self.replay_buffer.rng.integers(n_examples, size=self.example_batch_size))
+
+    def _loaded_examples(self) -> dict[str, np.ndarray]:
         if self._example_arrays is None or self._example_source is not self.examples:
             self._example_arrays, self._example_source = self._load_examples(), self.examples
-        arrays = self._example_arrays
-        rng = self.replay_buffer.rng
-        rows = rng.integers(len(next(iter(arrays.values()))), size=self.example_batch_size)
+        return self._example_arrays
+
+    def _examples_at(self, rows: np.ndarray | slice) -> PyTorchObs:
+        arrays = self._loaded_examples()
         batch = {key: th.as_tensor(array[rows], device=self.device) for key, array in arrays.items()}
         return batch if isinstance(self.observation_space, spaces.Dict) else batch[""]
 

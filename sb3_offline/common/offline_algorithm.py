@@ -53,7 +53,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     #: whether ``train()`` needs the dataset's action at the next step (and so leaves out each episode's last step)
     needs_next_actions: bool = False
     _replay_buffer: Any
-    _replay_buffer_source: Any
+    _opened_sources: tuple[Any, ...]
 
     def __init__(
         self,
@@ -125,7 +125,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     @property
     def replay_buffer(self) -> OfflineReplayBuffer:  # type: ignore[override]
         """The dataset as SB3's replay buffer; opened at the first use."""
-        if self._replay_buffer is None or self._replay_buffer_source is not self.dataset:
+        pairs = zip(self._data_sources(), self._opened_sources, strict=False)  # nothing was opened at first
+        if self._replay_buffer is None or any(new is not old for new, old in pairs):
             if self.dataset is None:
                 raise RuntimeError(
                     f"{type(self).__name__} has no dataset to learn from: pass `dataset=` to the constructor, "
@@ -144,13 +145,25 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             )
             if self._sampler_state is not None:
                 self._replay_buffer.set_rng_state(self._sampler_state)
-            self._fit_observation_statistics()
+            try:
+                self._prepare_data()
+            except BaseException:
+                self._replay_buffer = None  # never learn from data that are half prepared
+                raise
         return self._replay_buffer
 
     @replay_buffer.setter
     def replay_buffer(self, buffer: ReplayBuffer | None) -> None:
         self._replay_buffer = buffer
-        self._replay_buffer_source = getattr(self, "dataset", None)
+        self._opened_sources = self._data_sources() if buffer is not None else ()
+
+    def _data_sources(self) -> tuple[Any, ...]:
+        """What the buffer is made of: it is made anew when one of these is replaced."""
+        return (self.dataset,)
+
+    def _prepare_data(self) -> None:
+        """Called when the dataset was opened, before the first batch is drawn."""
+        self._fit_observation_statistics()
 
     def _fit_observation_statistics(self) -> None:
         normalize = self._vec_normalize_env
@@ -296,7 +309,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._torch_rng_state = None
 
     def _excluded_save_params(self) -> list[str]:
-        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_replay_buffer_source", "_metrics"]
+        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_opened_sources", "_metrics"]
         # An open dataset would be opened again by `load`, even to predict; paths are kept, so that it can go on learning.
         parts = self.dataset if isinstance(self.dataset, list | tuple) else [self.dataset]
         return [*excluded, "dataset"] if any(isinstance(part, OfflineDataset) for part in parts) else excluded

@@ -1,14 +1,61 @@
 """What algorithms share that learn from rewards."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import DatasetSource
+
+#: Rewards ``(batch,)`` of a batch of transitions.
+RewardFunction = Callable[[OfflineSamples], Any]
 
 
 class RewardBasedAlgorithm(ActorCriticAlgorithm):
-    """The base for algorithms that learn from the rewards of the dataset."""
+    """
+    The base for algorithms that learn from rewards: the dataset's, or others that take their place.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param dataset: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param reward_fn: a function or model that gives the rewards ``(batch,)`` of a batch of transitions, in place of the
+        dataset's. It is called once for each transition, when the dataset is opened, with an
+        :class:`~sb3_offline.data.buffer.OfflineSamples` (``observations``, ``actions`` scaled to [-1, 1],
+        ``next_observations``, ``dones``, ``rewards`` of the dataset, as tensors on the model's device), and is saved with
+        the model.
+    :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        reward_fn: RewardFunction | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, dataset, **kwargs)
+        self.reward_fn = reward_fn
+
+    def _data_sources(self) -> tuple[Any, ...]:
+        return (*super()._data_sources(), self.reward_fn)
+
+    def _prepare_data(self) -> None:
+        super()._prepare_data()
+        self._relabel()
+
+    def _relabel(self) -> None:
+        """Put the rewards that are learned from in place of the dataset's."""
+        if self.reward_fn is not None:
+            self.replay_buffer.relabel(self.reward_fn)
+        elif not self.replay_buffer.has_rewards:
+            remedy = "Record rewards, or say what they are: reward_fn=..."
+            raise DatasetError(self.replay_buffer.datasets[0].path, "rewards", "is missing", remedy)
 
     def _returns(self, batch: OfflineSamples) -> tuple[th.Tensor, th.Tensor, PyTorchObs]:
         """

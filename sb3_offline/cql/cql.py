@@ -7,8 +7,9 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
-from sb3_offline.common.reward_based import RewardBasedAlgorithm
-from sb3_offline.cql.losses import bellman_loss, conservative_gaps
+from sb3_offline.common.losses import bellman_loss
+from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.cql.losses import conservative_gaps
 from sb3_offline.data.reader import DatasetSource
 
 #: Bound of a learned ``cql_alpha``.
@@ -42,6 +43,8 @@ class CQL(RewardBasedAlgorithm):
     :param ent_coef: Entropy coefficient. ``"auto"`` (or ``"auto_0.1"``, for 0.1 as initial value) learns it
     :param target_entropy: target entropy when learning ``ent_coef``; ``"auto"`` is minus the number of action dimensions
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
+    :param reward_fn: rewards in place of the dataset's, see
+        :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
     :param random_shift: images are shifted by up to so many pixels
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
@@ -74,6 +77,7 @@ class CQL(RewardBasedAlgorithm):
         ent_coef: float | str = "auto",
         target_entropy: float | str = "auto",
         target_update_interval: int = 1,
+        reward_fn: RewardFunction | None = None,
         random_shift: int = 4,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
@@ -88,6 +92,7 @@ class CQL(RewardBasedAlgorithm):
             policy,
             env,
             dataset,
+            reward_fn,
             learning_rate=learning_rate,
             batch_size=batch_size,
             tau=tau,

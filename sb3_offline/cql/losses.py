@@ -1,21 +1,6 @@
-"""
-The losses of CQL as plain functions of values. They know no network, optimizer or dataset.
-
-All values carry the critics as their first axis.
-"""
+"""The conservative term of CQL as a plain function of values. It knows no network, optimizer or dataset."""
 
 import torch as th
-
-
-def bellman_loss(values: th.Tensor, targets: th.Tensor) -> th.Tensor:
-    """
-    ``sum_i E_D[(Q_i(s, a) - y)^2]``.
-
-    :param values: of dataset actions, ``(n_critics, batch)``
-    :param targets: y, no gradient, ``(batch,)``
-    :return: scalar, summed over the critics
-    """
-    return (values - targets).pow(2).mean(dim=1).sum()
 
 
 def conservative_gaps(data_values: th.Tensor, sampled_values: th.Tensor, log_densities: th.Tensor) -> th.Tensor:

@@ -1,7 +1,7 @@
 """A replay buffer over datasets on disk."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -99,7 +99,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             problem = f"is {datasets[0].action_space}, but the learner has {action_space}"
             remedy = "Use the environment that the data were collected in"
             if datasets[0].guessed_actions:
-                remedy = "A D4RL-style file declares no bounds: give OfflineDataset(path, action_space=...)"
+                remedy = "The file declares no bounds: give OfflineDataset(path, action_space=...)"
             raise DatasetError(datasets[0].path, "action_space", problem, remedy)
         lengths = np.concatenate([d.lengths for d in datasets])
         self._index_steps(lengths)
@@ -229,6 +229,37 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def _column(self, values: np.ndarray) -> th.Tensor:
         return self._to_device(values.astype(np.float32).reshape(-1, 1))
+
+    @property
+    def has_rewards(self) -> bool:
+        """Whether the files hold rewards."""
+        return "rewards" in self.datasets[0].arrays
+
+    def relabel(
+        self, reward_fn: Callable[[OfflineSamples], Any], env: VecNormalize | None = None, batch_size: int = 512
+    ) -> None:
+        """
+        Replace all rewards, in memory; the files stay as they are.
+
+        :param reward_fn: gives the rewards (B,) of a batch of one-step transitions, as a tensor or an array; called without
+            gradients, once for each transition, in their order
+        :param env: normalises the observations that it sees
+        :param batch_size: transitions at a time
+        """
+        rewards = np.empty(self.buffer_size, np.float32)
+        n_steps, self.n_steps = self.n_steps, 1  # no windows: they would only read more frames
+        try:
+            for first in range(0, self.buffer_size, batch_size):
+                steps = np.arange(first, min(first + batch_size, self.buffer_size))
+                with th.no_grad():
+                    values = th.as_tensor(reward_fn(self.transitions(steps, env))).to("cpu", th.float32)
+                if values.shape not in ((len(steps),), (len(steps), 1)) or not values.isfinite().all():
+                    problem = f"gave {values} of shape {tuple(values.shape)} for {len(steps)} transitions"
+                    raise DatasetError("", "reward_fn", problem, "Return one finite number for each transition")
+                rewards[steps] = values.flatten().numpy()
+        finally:
+            self.n_steps = n_steps
+        self.rewards = rewards
 
     def observation_statistics(self, keys: Sequence[str] | None = None) -> Any:
         """
