@@ -7,11 +7,20 @@ from sb3_offline.bc import BC
 from sb3_offline.ceborl import CEBORL
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.cql import CQL
+from sb3_offline.iql import IQL
 from sb3_offline.rce import RCE
+from sb3_offline.td3_bc import TD3BC
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 #: All algorithms by the names that configs and the command line use.
-ALGOS: dict[str, type[OfflineAlgorithm]] = {"bc": BC, "ceborl": CEBORL, "cql": CQL, "rce": RCE}
+ALGOS: dict[str, type[OfflineAlgorithm]] = {
+    "bc": BC,
+    "ceborl": CEBORL,
+    "cql": CQL,
+    "iql": IQL,
+    "rce": RCE,
+    "td3_bc": TD3BC,
+}
 
-__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "RCE", "OfflineAlgorithm", "__version__"]
+__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "IQL", "RCE", "TD3BC", "OfflineAlgorithm", "__version__"]

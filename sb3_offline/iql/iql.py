@@ -1,0 +1,139 @@
+"""IQL: Implicit Q-Learning."""
+
+from typing import Any, Literal
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_offline.common.losses import bellman_loss
+from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.data.reader import DatasetSource
+from sb3_offline.iql.losses import advantage_weights, expectile_loss
+
+
+class IQL(RewardBasedAlgorithm):
+    """
+    Implicit Q-Learning (IQL, https://arxiv.org/abs/2110.06169): never values an action that the dataset does not have::
+
+        value:   min  E_D[L(min_i Qbar_i(s, a) - V(s))],    L(u) = |expectile - 1(u < 0)| u^2
+        critic:  min  sum_i E_D[(Q_i(s, a) - r - gamma (1 - terminated) V(s'))^2]
+        actor:   max  E_D[exp(inverse_temperature (min_i Qbar_i(s, a) - V(s))) log pi(a | s)]
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment the policy is meant for, a registered id, or ``None`` (spaces from the dataset)
+    :param dataset: Path(s) of HDF5 datasets, or a glob pattern
+    :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
+    :param batch_size: Transitions in a batch
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor
+    :param n_steps: steps of rewards before the target's value (1: as above)
+    :param expectile: of the values of the data's actions that V(s) is: 0.5 for their mean, towards 1 for the best of them
+    :param inverse_temperature: beta of the advantage weights: 0 for behavioral cloning, the larger, the more the best actions
+        count
+    :param weight_max: bound of the advantage weights
+    :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
+    :param reward_fn: rewards in place of the dataset's, see
+        :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
+    :param random_shift: images are shifted by up to so many pixels
+    :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
+    :param stats_window_size: kept for SB3's signature
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        n_steps: int = 1,
+        expectile: float = 0.7,
+        inverse_temperature: float = 3.0,
+        weight_max: float = 100.0,
+        target_update_interval: int = 1,
+        reward_fn: RewardFunction | None = None,
+        random_shift: int = 4,
+        dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            dataset,
+            reward_fn,
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            n_steps=n_steps,
+            target_update_interval=target_update_interval,
+            random_shift=random_shift,
+            dataset_storage=dataset_storage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+        )
+        self.expectile = expectile
+        self.inverse_temperature = inverse_temperature
+        self.weight_max = weight_max
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self.policy_kwargs.setdefault("critic_state_value", True)
+        self.policy_kwargs.setdefault("std_min", 0.05)
+        super()._setup_model()
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            observations = self.augment(batch.observations)
+            features = self.critic.encode(observations)
+            policy_features = self._policy_features(observations, features)
+            with th.no_grad():
+                rewards, discounts, next_observations = self._returns(batch)
+                targets = rewards + discounts * self.critic.state_values(self.critic.encode(next_observations))
+                target_values = self.critic_target.values(self.critic_target.encode(observations), batch.actions).amin(dim=0)
+
+            values = self.critic.values(features, batch.actions)
+            advantages = target_values - self.critic.state_values(features)
+            value_loss = expectile_loss(advantages, self.expectile)
+            critic_loss = bellman_loss(values, targets)
+            self._optimize(self.critic.optimizer, critic_loss + value_loss)
+
+            weights = advantage_weights(advantages.detach(), self.inverse_temperature, self.weight_max)
+            actor_loss = (weights * self.actor.regression_loss(policy_features, batch.actions)).mean()
+            self._optimize(self.actor.optimizer, actor_loss)
+
+            self._n_updates += 1
+            self._update_target()
+            self._record(
+                critic_loss=critic_loss,
+                value_loss=value_loss,
+                actor_loss=actor_loss,
+                values_data=values.mean(),
+                advantage=advantages.mean(),
+                effective_weights=weights.sum() ** 2 / weights.pow(2).sum() / batch_size,
+            )
