@@ -21,7 +21,29 @@ def table(path: Path) -> str:
     """:return: the CSV file as a Markdown table"""
     with path.open() as file:
         rows = list(csv.DictReader(file))
-    return checkpoint_table(rows) if "variant" in rows[0] else result_table(rows)
+    if "change" in rows[0]:
+        return checkpoint_table(rows)
+    return rate_table(rows) if "commit" in rows[0] else result_table(rows)
+
+
+def rate_table(rows: list[dict[str, str]]) -> str:
+    """A row a method or variant, a column a task: the success rate of all episodes and, of several seeds, the lowest and highest."""
+    name = "variant" if "variant" in rows[0] else "method"
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    lines = [f"| {name} | " + " | ".join([*tasks, "mean"]) + " |", "|---" * (len(tasks) + 2) + "|"]
+    for label in dict.fromkeys(row[name] for row in rows):
+        cells, means = [], []
+        for task in tasks:
+            own = [row for row in rows if row[name] == label and row["task"] == task]
+            seeds = [[row for row in own if row["seed"] == seed] for seed in dict.fromkeys(row["seed"] for row in own)]
+            rates = [sum(int(row["successes"]) for row in part) / sum(int(row["episodes"]) for row in part) for part in seeds]
+            means += [sum(rates) / len(rates)] if rates else []
+            spread = f" ({min(rates):.2f} to {max(rates):.2f})" if len(rates) > 1 else ""
+            crashed = ", crashed" if any("failed: " in row["config"] for row in own) else ""
+            cells.append(f"{means[-1]:.2f}{spread}{crashed}" if rates else "")
+        mean = f"{sum(means) / len(means):.2f}" if len(means) == len(tasks) else ""
+        lines.append(f"| {label} | " + " | ".join([*cells, mean]) + " |")
+    return "\n".join(lines)
 
 
 def checkpoint_table(rows: list[dict[str, str]]) -> str:

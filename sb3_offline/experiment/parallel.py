@@ -48,6 +48,8 @@ def train_in_parallel(
     :param keep_going: let the other runs finish where one fails; else its error is raised at once
     :return: what went wrong, by label
     """
+    if not runs:
+        return {}
     context = multiprocessing.get_context("spawn")
     reports = context.Manager().Queue()
     bars: dict[str, tqdm] = {}
