@@ -27,7 +27,7 @@ def table(path: Path) -> str:
 
 
 def rate_table(rows: list[dict[str, str]]) -> str:
-    """A row a method or variant, a column a task: the success rate of all episodes and, of several seeds, the lowest and highest."""
+    """A row a method or variant, a column a task: the mean success rate and, of several seeds, the lowest and the highest."""
     name = "variant" if "variant" in rows[0] else "method"
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     lines = [f"| {name} | " + " | ".join([*tasks, "mean"]) + " |", "|---" * (len(tasks) + 2) + "|"]
