@@ -1,18 +1,34 @@
-"""Convert a dataset between contiguous storage (for training) and compressed storage (for keeping and sending)."""
+"""Convert a dataset to this library's storage, from any other or from other libraries' files, or to a Minari dataset."""
 
 import argparse
+from typing import Any
 
 from sb3_offline.data.convert import convert
+from sb3_offline.data.reader import OfflineDataset
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: gets the options of ``run``"""
-    parser.add_argument("source", help="dataset file of either storage, or a D4RL-style file")
-    parser.add_argument("destination", help="file to write")
-    parser.add_argument("--storage", choices=("contiguous", "compressed"), required=True)
+    formats = "D4RL-style file, minari:ID, SB3 replay buffer (.pkl), or rollouts of imitation (.npz, folder)"
+    parser.add_argument("source", help=f"dataset file of either storage, {formats}")
+    parser.add_argument("destination", help="file to write, or minari:ID")
+    parser.add_argument("--storage", choices=("contiguous", "compressed"), default="contiguous", help="of the file to write")
+    parser.add_argument(
+        "--env", help="id of the environment, whose spaces and time limit count where the source declares none"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace the destination")
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    convert(args.source, args.destination, args.storage, overwrite=args.overwrite)
+    declared: dict[str, Any] = {}
+    if args.env:
+        import gymnasium as gym
+
+        env = gym.make(args.env)
+        declared = {"observation_space": env.observation_space, "action_space": env.action_space}
+        declared["max_episode_steps"] = env.spec.max_episode_steps if env.spec else None
+        env.close()
+    dataset = OfflineDataset(args.source, **declared)
+    dataset.header.env_id = dataset.header.env_id or args.env or ""
+    convert(dataset, args.destination, args.storage, overwrite=args.overwrite)

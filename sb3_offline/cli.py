@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(f'sb3-offline: {error}; install it with: pip install "sb3-offline[{extra}]"')
 
 
-_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots"}
+_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots", "minari": "minari", "pyarrow": "imitation"}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
     _add(commands, "examples", "take success examples out of a labelled dataset", _tool("extract_examples"))
     _add(commands, "inspect", "say what is in a dataset and what looks wrong", _tool("inspect_dataset"))
     _add(commands, "render", "draw the frames of a dataset anew, of another size or camera", _tool("render_dataset"))
-    _add(commands, "convert", "compress a dataset, or lay it out raw for training", _tool("convert_dataset"))
+    _add(commands, "convert", "compress a dataset, lay it out raw, or take over another library's", _tool("convert_dataset"))
     _add(commands, "train", "train one policy", _train)
     _add(commands, "evaluate", "play a trained policy", _evaluate)
     _add(commands, "demo", "collect, train, evaluate and report, all by itself", _demo)

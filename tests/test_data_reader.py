@@ -92,7 +92,7 @@ def test_damage_is_named_by_file_field_and_remedy(tmp_path, damage, message):
 
 
 @pytest.mark.parametrize("storage", ["contiguous", "compressed"])
-@pytest.mark.parametrize("state", [STATES, spaces.Box(-1, 1, (4, 3))])
+@pytest.mark.parametrize("state", [STATES, spaces.Box(-1, 1, (4, 3)), spaces.Box(-9, 9, (3, 4, 1))])
 def test_nan_in_states_is_found(tmp_path, monkeypatch, storage, state):
     monkeypatch.setattr("sb3_offline.data.reader.CHECK_BYTES", 100)  # several pieces
     write_dataset(tmp_path / "whole.h5", space=spaces.Dict({"image": IMAGES, "state": state}))

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from os import PathLike
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
@@ -16,6 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from sb3_offline.common.augmentation import shift_observations
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
@@ -94,8 +96,12 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             seed=seed,
             support_multi_env=True,
             sde_support=False,
-            supported_action_spaces=(spaces.Box,),
         )
+        if env is not None and not isinstance(self.action_space, spaces.Box):
+            source = dataset if isinstance(dataset, str | PathLike) else ""
+            remedy = "Use an environment, and data of it, with a Box of actions"
+            problem = f"is {self.action_space}, but {type(self).__name__} learns continuous actions (Box) only"
+            raise DatasetError(source, "action_space", problem, remedy)
         # A plain attribute, so that `load(path, dataset=...)` can replace it; opened when the first batch is drawn.
         self.dataset = dataset
         self.dataset_storage = dataset_storage

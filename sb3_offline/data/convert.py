@@ -1,4 +1,4 @@
-"""Datasets between contiguous storage (for training) and compressed storage (for keeping and sending)."""
+"""Datasets from one form to another: contiguous (for training), compressed (for keeping and sending), and other libraries'."""
 
 import os
 from pathlib import Path
@@ -9,6 +9,7 @@ from tqdm.auto import tqdm
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
 from sb3_offline.data.format import CHUNK_BYTES, Storage, create_file
+from sb3_offline.data.minari import PREFIX, write_minari
 from sb3_offline.data.reader import OfflineDataset
 
 PIECE_BYTES = 1 << 25
@@ -17,21 +18,26 @@ PIECE_BYTES = 1 << 25
 def convert(
     source: str | os.PathLike | OfflineDataset,
     destination: str | os.PathLike,
-    storage: Storage,
+    storage: Storage = "contiguous",
     *,
     overwrite: bool = False,
     progress_bar: bool = True,
 ) -> None:
     """
-    Copy a dataset to another storage; every value and attribute stays the same. The destination appears whole or not at all.
+    Copy a dataset to another form; every value and attribute stays the same. The destination appears whole or not at
+    all.
 
-    :param source: a dataset file of either storage, or a D4RL-style file
-    :param destination: file to write; may be the source itself with ``overwrite``
-    :param storage: "contiguous" or "compressed" (gzip)
+    :param source: whatever :class:`~sb3_offline.data.reader.OfflineDataset` opens
+    :param destination: file to write, which may be the source itself with ``overwrite``; or ``minari:namespace/name-v0``, a
+        new Minari dataset
+    :param storage: "contiguous" or "compressed" (gzip), of a file
     :param overwrite: replace an existing file
     :param progress_bar: show progress
     """
     dataset = source if isinstance(source, OfflineDataset) else OfflineDataset(source)
+    if os.fspath(destination).startswith(PREFIX):
+        write_minari(dataset, os.fspath(destination))
+        return
     path = Path(destination)
     if path.exists() and not overwrite:
         raise DatasetError(path, "file", "exists already", "Give another name, or overwrite it (--overwrite)")

@@ -13,7 +13,9 @@ from gymnasium import spaces
 from sb3_offline.data.d4rl import is_d4rl, read_d4rl
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import open_hdf5
+from sb3_offline.data.foreign import read_foreign
 from sb3_offline.data.format import Field, Header, Storage, read_header
+from sb3_offline.data.minari import PREFIX, dataset_folder
 from sb3_offline.data.spaces import subspaces
 
 CHECK_BYTES = 1 << 24
@@ -57,8 +59,10 @@ ArrayLike = np.ndarray | HDF5Array
 
 class OfflineDataset:
     """
-    A dataset file of format version 1, or a D4RL-style HDF5 file. Opening checks it and raises ``DatasetError`` with the
-    file, the field and the remedy.
+    A dataset file of format version 1, or data of another library: a D4RL-style HDF5 file, a Minari dataset
+    (``minari:namespace/name-v0``, or its folder), a pickled replay buffer of SB3 (``.pkl``; open none that you do not trust),
+    or rollouts of `imitation` (``.npz``, or a folder). Opening checks it and raises ``DatasetError`` with the file, the field
+    and the remedy.
 
     Arrays are flat over all steps; episode e has its steps at ``step_starts[e] + arange(lengths[e])`` and its
     observations, one more, at ``observation_starts[e] + arange(lengths[e] + 1)``.
@@ -70,13 +74,15 @@ class OfflineDataset:
       an ``HDF5Array`` in compressed storage. ``extras``: likewise, (N, ...) by name
     - ``actions`` ``(N, *shape)`` float32 in environment units, ``rewards`` (N,) float32 or ``None``, ``terminated``,
       ``truncated`` (N,) bool, ``success`` (N,) bool or ``None``
-    - ``storage``: "contiguous", "compressed", or "memory" (D4RL, or chosen episodes)
+    - ``storage``: "contiguous", "compressed", or "memory" (other libraries' data, or chosen episodes)
 
     It pickles as its path and what was chosen.
 
-    :param path: the file
-    :param observation_space: space of a D4RL-style file, which declares none (default: unbounded, from the data)
+    :param path: the file, folder, or ``minari:`` id
+    :param observation_space: space of D4RL-style files and of rollouts, which declare none (default: unbounded, from the data)
     :param action_space: likewise (default: [-1, 1])
+    :param max_episode_steps: time limit of the environment, for rollouts of `imitation` and for replay buffers without
+        ``handle_timeout_termination``, which call every end of an episode terminal
     :param episodes: numbers of the episodes to hold, as if the file had no others; they are read into memory
     """
 
@@ -86,24 +92,23 @@ class OfflineDataset:
         *,
         observation_space: spaces.Space | None = None,
         action_space: spaces.Space | None = None,
+        max_episode_steps: int | None = None,
         episodes: Sequence[int] | np.ndarray | None = None,
     ):
-        self.path = Path(path).absolute()
+        self.path = dataset_folder(path) if os.fspath(path).startswith(PREFIX) else Path(path).absolute()
+        self.storage: Storage | str = "memory"
         self._options: dict[str, Any] = {
             "observation_space": observation_space,
             "action_space": action_space,
+            "max_episode_steps": max_episode_steps,
             "episodes": episodes,
         }
-        with open_hdf5(self.path) as file:
-            self._declares_spaces = not is_d4rl(file)
-            if not self._declares_spaces:
-                header, arrays = read_d4rl(file, self.path, observation_space, action_space)
-                self.storage: Storage | str = "memory"
-                n_episodes = len(arrays["episodes/length"])
-            else:
-                header = read_header(file, self.path)
-                n_episodes, arrays = self._read_arrays(file, header)
-                self.storage = "contiguous" if file["actions"].chunks is None else "compressed"
+        foreign = read_foreign(self.path, observation_space, action_space, max_episode_steps)
+        if foreign is not None:
+            header, arrays, self._declares_spaces = foreign
+            n_episodes = len(arrays["episodes/length"])
+        else:
+            header, arrays, n_episodes = self._read_hdf5(observation_space, action_space)
         if episodes is not None:
             arrays = _chosen_rows(arrays, np.asarray(episodes, dtype=np.int64))
             n_episodes, self.storage = len(episodes), "memory"
@@ -129,7 +134,7 @@ class OfflineDataset:
 
     @property
     def guessed_actions(self) -> bool:
-        """:return: whether the action space is a guess, since the file (D4RL) declares none and none was given"""
+        """:return: whether the action space is a guess, since the source declares none and none was given"""
         return not self._declares_spaces and self._options["action_space"] is None
 
     def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
@@ -140,6 +145,19 @@ class OfflineDataset:
         given = self._options["episodes"]
         numbers = np.asarray(episodes, dtype=np.int64) if given is None else np.asarray(given)[episodes]
         return OfflineDataset(self.path, **{**self._options, "episodes": numbers})
+
+    def _read_hdf5(
+        self, observation_space: spaces.Space | None, action_space: spaces.Space | None
+    ) -> tuple[Header, dict[str, Any], int]:
+        with open_hdf5(self.path) as file:
+            self._declares_spaces = not is_d4rl(file)
+            if not self._declares_spaces:
+                header, arrays = read_d4rl(file, self.path, observation_space, action_space)
+                return header, arrays, len(arrays["episodes/length"])
+            header = read_header(file, self.path)
+            n_episodes, arrays = self._read_arrays(file, header)
+            self.storage = "contiguous" if file["actions"].chunks is None else "compressed"
+            return header, arrays, n_episodes
 
     def _read_arrays(self, file: h5py.File, header: Header) -> tuple[int, dict[str, Any]]:
         """Map or read the committed rows of every array. A file that a killed writer left has room for more than these."""
@@ -182,9 +200,8 @@ class OfflineDataset:
         return array[:rows]
 
     def _check(self, arrays: dict[str, Any]) -> None:
-        """Check the values of everything but images: those are large, and in integers cannot hold NaN."""
-        small = [n for n, s in subspaces(self.observation_space, "observations").items() if len(s.shape or ()) != 3]
-        for name in ["actions", "rewards", *small]:
+        """Check all values that can be wrong; images of integers cannot, and are large."""
+        for name in ["actions", "rewards", *subspaces(self.observation_space, "observations")]:
             if name in arrays and arrays[name].dtype.kind == "f":
                 self._check_finite(name, arrays[name])
         inside = np.ones(self.n_steps, dtype=bool)

@@ -1,0 +1,107 @@
+"""Flat transitions of other libraries, cut into the episodes of our format; spaces where a source declares none."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.format import Header
+from sb3_offline.data.spaces import check_observations, check_rows
+
+
+def cut_episodes(
+    header: Header,
+    path: str | os.PathLike,
+    *,
+    observations: Mapping[str, np.ndarray],
+    next_observations: Mapping[str, np.ndarray] | None,
+    known: np.ndarray,
+    ends: np.ndarray,
+    steps: Mapping[str, np.ndarray],
+) -> dict[str, Any]:
+    """
+    Cut n transitions, in their order, into episodes.
+
+    Where the observation after an episode's last step is not known, a terminated episode repeats its last observation there:
+    learners that stop at ``terminated`` never use it, but to those that ignore it, as learners from success examples do, the
+    last step seems to change nothing. Any other episode ends one step earlier instead.
+
+    :param header: spaces and optional arrays
+    :param path: for error messages
+    :param observations: (n, ...) by array name, ``observations`` or ``observations/key``
+    :param next_observations: likewise; looked at in last steps alone
+    :param known: (n,) bool, whether ``next_observations`` hold what followed the step
+    :param ends: (n,) bool, whether a step is the last one of its episode
+    :param steps: all other arrays with one row per step; ``terminated`` and ``truncated`` are looked at in last steps alone
+    :return: arrays by name, as ``Header.fields`` names them
+    """
+    last = np.flatnonzero(ends)
+    first = np.append(0, last[:-1] + 1)
+    lost = ~steps["terminated"][last] & ~known[last]
+    kept = last + 1 - first - lost > 0
+    first, last, lost = first[kept], last[kept], lost[kept]
+    lengths = last + 1 - first - lost
+    step_rows, observation_rows = _ranges(first, lengths), _ranges(first, lengths + 1)
+    final = np.cumsum(lengths + 1) - 1  # where the last observation of each episode goes
+    observation_rows[final] -= ~lost  # the observation of a lost step is the last one; without it there is none after `last`
+    arrays: dict[str, Any] = {"episodes/length": lengths, "episodes/seed": np.full(len(lengths), -1, dtype=np.int64)}
+    cut = {name: array[observation_rows] for name, array in observations.items()}
+    for name, array in (next_observations or {}).items():
+        cut[name][final[known[last]]] = array[last[known[last]]]
+    arrays |= checked_observations(cut, header.observation_space, path)
+    fields = header.fields()
+    for name, array in steps.items():
+        rows = array[step_rows]
+        if name in ("terminated", "truncated"):
+            rows = np.zeros(len(step_rows), dtype=bool)
+            rows[np.cumsum(lengths) - 1] = array[last]
+        arrays[name] = check_rows(rows, fields[name].shape, fields[name].dtype, None, path, name)
+    return arrays
+
+
+def checked_observations(arrays: Mapping[str, np.ndarray], space: spaces.Space, path: str | os.PathLike) -> dict[str, Any]:
+    """
+    :param arrays: observations by array name, ``observations`` or ``observations/key``
+    :param space: their space
+    :param path: for error messages
+    :return: these arrays with the dtypes of the space; raises ``DatasetError`` where they do not fit it
+    """
+    value: Any = arrays["observations"] if "observations" in arrays else None
+    if isinstance(space, spaces.Dict):
+        value = {name.removeprefix("observations/"): array for name, array in arrays.items()}
+    return check_observations(value, space, None, path)
+
+
+def _ranges(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """:return: the concatenation of ``arange(start, start + length)``"""
+    offsets = np.cumsum(lengths) - lengths
+    return np.arange(lengths.sum()) + np.repeat(starts - offsets, lengths)
+
+
+def guess_observation_space(observations: np.ndarray) -> spaces.Box:
+    """
+    :param observations: (n, ...) of a source that declares no space
+    :return: 0 to 255 for uint8, unbounded for anything else
+    """
+    if observations.dtype == np.uint8:
+        return spaces.Box(0, 255, observations.shape[1:], np.uint8)
+    return spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
+
+
+def guess_action_space(actions: np.ndarray, path: str | os.PathLike) -> spaces.Box:
+    """
+    :param actions: (n, ...) of a source that declares no space
+    :param path: for error messages
+    :return: [-1, 1]; raises ``DatasetError`` where the actions are integers or larger
+    """
+    remedy = "Open it with OfflineDataset(path, action_space=...), or convert it with --env ID"
+    if actions.dtype.kind != "f":
+        problem = f"has dtype {actions.dtype}, and a file of this kind does not say which actions there are"
+        raise DatasetError(path, "actions", problem, remedy)
+    if np.abs(actions).max() > 1 + 1e-5:
+        problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and a file of this kind declares no bounds"
+        raise DatasetError(path, "actions", problem, remedy)
+    return spaces.Box(-1.0, 1.0, actions.shape[1:], np.float32)
