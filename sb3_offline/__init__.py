@@ -7,7 +7,9 @@ from sb3_offline.bc import BC
 from sb3_offline.ceborl import CEBORL
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.cql import CQL
+from sb3_offline.dcql import DCQL
 from sb3_offline.iql import IQL
+from sb3_offline.oril import ORIL
 from sb3_offline.rce import RCE
 from sb3_offline.td3_bc import TD3BC
 
@@ -18,9 +20,11 @@ ALGOS: dict[str, type[OfflineAlgorithm]] = {
     "bc": BC,
     "ceborl": CEBORL,
     "cql": CQL,
+    "dcql": DCQL,
     "iql": IQL,
+    "oril": ORIL,
     "rce": RCE,
     "td3_bc": TD3BC,
 }
 
-__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "IQL", "RCE", "TD3BC", "OfflineAlgorithm", "__version__"]
+__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "DCQL", "IQL", "ORIL", "RCE", "TD3BC", "OfflineAlgorithm", "__version__"]

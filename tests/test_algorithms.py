@@ -78,6 +78,8 @@ def make(algo, policy, files, env=None, **kwargs):
     dataset, examples = files[policy]
     if needs_examples(algo):
         kwargs = {"examples": examples, "example_batch_size": 4, **kwargs}
+    if algo == "oril":
+        kwargs = {"reward_steps": 3, **kwargs}
     small = {"net_arch": [16, 16]}
     if policy == "CnnPolicy":
         small["features_extractor_kwargs"] = {"features_dim": 16}

@@ -1,0 +1,77 @@
+"""d-CQL: CQL on the distance to goals."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.cql.cql import CQL
+from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.reader import DatasetSource
+from sb3_offline.dcql.distances import ObservationVectors, mean_distance
+
+
+class DCQL(ExampleBasedAlgorithm, CQL):
+    """
+    CQL with a naive reward (d-CQL): minus the mean distance between an observation and the success examples::
+
+        r(s) = -reward_scale E_{s* ~ S*}[|s - s*|]
+
+    Pixels lie in [0, 1]; vectors are standardised by the dataset. The rewards are computed once, when the dataset is opened.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: see :class:`~sb3_offline.cql.cql.CQL`
+    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; rewards in it are not looked at
+    :param examples: Success examples S*: a folder of pictures, an ``.npz`` or HDF5 file, or an array of observations. All of
+        them are goals.
+    :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
+    :param distance: ``"l2"``, the Euclidean norm of the difference, or ``"mse"``, the mean of its squares
+    :param reward_scale: factor of the rewards
+    :param cql_alpha: weight of the conservative term, see :class:`~sb3_offline.cql.cql.CQL`
+    :param ent_coef: Entropy coefficient, see :class:`~sb3_offline.cql.cql.CQL`
+    :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        distance: str = "l2",
+        reward_scale: float = 1.0,
+        cql_alpha: float | str = 0.1,
+        ent_coef: float | str = 1e-4,
+        **kwargs: Any,
+    ):
+        if distance not in ("l2", "mse"):
+            raise TypeError(f"DCQL: distance is {distance!r}; choose 'l2' or 'mse'")
+        self.distance = distance
+        self.reward_scale = reward_scale
+        super().__init__(
+            policy,
+            env,
+            dataset,
+            examples,
+            learning_rate=learning_rate,
+            cql_alpha=cql_alpha,
+            ent_coef=ent_coef,
+            **kwargs,
+        )
+
+    def _data_sources(self) -> tuple[Any, ...]:
+        return (*super()._data_sources(), self.examples)
+
+    def _relabel(self) -> None:
+        buffer, normalize = self.replay_buffer, self._vec_normalize_env
+        is_normalized = normalize is not None and normalize.norm_obs
+        vectors = ObservationVectors(self.observation_space, None if is_normalized else buffer.observation_statistics)
+        goals = vectors(self.all_examples())
+
+        def reward(batch: OfflineSamples) -> th.Tensor:
+            return -self.reward_scale * mean_distance(vectors(batch.observations), goals, self.distance)
+
+        buffer.relabel(reward, normalize)

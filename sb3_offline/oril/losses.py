@@ -1,0 +1,22 @@
+"""The losses of ORIL's reward classifier as a plain function of logits."""
+
+import torch as th
+from torch.nn import functional as F
+
+
+def classifier_loss(example_logits: th.Tensor, data_logits: th.Tensor, positive_prior: float | None = None) -> th.Tensor:
+    """
+    Cross-entropy of examples (label 1) and observations of the dataset (label 0).
+
+    The dataset is not all failures. With ``positive_prior`` eta it counts as a mixture, of which a share eta is like the
+    examples: ``eta CE(f_E; 1) + CE(f_U; 0) - eta CE(f_E; 0)``.
+
+    :param example_logits: of success examples, f_E, ``(n_examples,)``
+    :param data_logits: of dataset observations, f_U, ``(batch,)``
+    :param positive_prior: eta; ``None`` for the plain cross-entropy
+    :return: scalar
+    """
+    positives, negatives = F.softplus(-example_logits).mean(), F.softplus(data_logits).mean()
+    if positive_prior is None:
+        return positives + negatives
+    return positive_prior * positives + negatives - positive_prior * F.softplus(example_logits).mean()

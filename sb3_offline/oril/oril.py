@@ -1,0 +1,110 @@
+"""ORIL: Offline Reinforced Imitation Learning, from examples of success."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.cql.cql import CQL
+from sb3_offline.data.reader import DatasetSource
+from sb3_offline.oril.losses import classifier_loss
+from sb3_offline.oril.reward_model import RewardClassifier
+
+
+class ORIL(ExampleBasedAlgorithm, CQL):
+    """
+    Offline Reinforced Imitation Learning (ORIL, https://arxiv.org/abs/2011.13885): a classifier learns to tell success
+    examples from the dataset, its probability becomes the reward, and CQL learns from that::
+
+        r(s) = sigmoid(f(s)),    f:  min  E_{s ~ S*}[CE(f(s); 1)] + E_{s ~ D}[CE(f(s); 0)]
+
+    The classifier is trained and the rewards are computed once, when the dataset is opened; both stay as they are then. The
+    classifier is saved with the model, so a loaded model computes the same rewards without the examples.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: see :class:`~sb3_offline.cql.cql.CQL`
+    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; rewards in it are not looked at
+    :param examples: Success examples S*: a folder of pictures, an ``.npz`` or HDF5 file, or an array of observations
+    :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
+    :param example_batch_size: success examples in a batch of the classifier, beside ``batch_size`` observations of the dataset
+    :param reward_steps: gradient steps of the classifier
+    :param reward_learning_rate: learning rate of the classifier
+    :param positive_prior: share of the dataset that looks like the examples, for positive-unlabelled learning of the
+        classifier (ORIL's authors: 0.5); ``None`` for plain cross-entropy
+    :param cql_alpha: weight of the conservative term, see :class:`~sb3_offline.cql.cql.CQL`
+    :param ent_coef: Entropy coefficient, see :class:`~sb3_offline.cql.cql.CQL`
+    :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
+    """
+
+    reward_model: RewardClassifier
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        example_batch_size: int = 256,
+        reward_steps: int = 1000,
+        reward_learning_rate: float = 3e-4,
+        positive_prior: float | None = None,
+        cql_alpha: float | str = 0.1,
+        ent_coef: float | str = 1e-4,
+        **kwargs: Any,
+    ):
+        self.reward_steps = reward_steps
+        self.reward_learning_rate = reward_learning_rate
+        self.positive_prior = positive_prior
+        super().__init__(
+            policy,
+            env,
+            dataset,
+            examples,
+            example_batch_size,
+            learning_rate=learning_rate,
+            cql_alpha=cql_alpha,
+            ent_coef=ent_coef,
+            **kwargs,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.reward_model = RewardClassifier(
+            self.observation_space,
+            self.action_space,
+            features_extractor=self.policy.make_features_extractor(),
+            net_arch=self.policy.critic_kwargs["net_arch"],  # type: ignore[arg-type]
+            normalize_images=self.policy.normalize_images,
+        ).to(self.device)
+
+    def _relabel(self) -> None:
+        if not self.reward_model.trained:
+            self._train_reward_model()
+        self.reward_model.set_training_mode(False)
+        self.replay_buffer.relabel(lambda batch: self.reward_model(batch.observations).sigmoid(), self._vec_normalize_env)
+
+    def _train_reward_model(self) -> None:
+        model, encoder = self.reward_model, self.reward_model.features_extractor
+        assert encoder is not None
+        for name, statistics in self.critic.features_extractor.named_buffers():  # of the dataset, for vectors
+            encoder.get_buffer(name).copy_(statistics)
+        model.set_training_mode(True)
+        optimizer = th.optim.Adam(model.parameters(), lr=self.reward_learning_rate)
+        for _ in range(self.reward_steps):
+            data_logits = model(self.augment(self.replay_buffer.sample(self.batch_size, self._vec_normalize_env).observations))
+            example_logits = model(self.augment(self.sample_examples()))
+            loss = classifier_loss(example_logits, data_logits, self.positive_prior)
+            self._optimize(optimizer, loss)
+            self._record(
+                reward_model_loss=loss,
+                reward_examples=example_logits.sigmoid().mean(),
+                reward_data=data_logits.sigmoid().mean(),
+            )
+        model.trained.fill_(True)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        return [*state_dicts, "reward_model"], variables
