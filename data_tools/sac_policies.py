@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -46,14 +50,20 @@ class SacActor:
         return np.tanh(action).astype(np.float32)
 
 
-def actor_weights(state_dict: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def actor_weights(
+    state_dict: Mapping[str, np.ndarray], offset: np.ndarray | float = 0.0, scale: np.ndarray | float = 1.0
+) -> dict[str, np.ndarray]:
     """
     :param state_dict: of SB3's SAC actor, as arrays
-    :return: what :class:`SacActor` takes, in float32
+    :param offset: (n,) or a number; the actor was trained on ``(state - offset) / scale``
+    :param scale: (n,) or a number
+    :return: what :class:`SacActor` takes, in float32, for states as they are
     """
     hidden = sorted((name for name in state_dict if name.startswith("latent_pi.")), key=lambda name: int(name.split(".")[1]))
-    weights = {f"{i // 2}.{name.split('.')[2]}": state_dict[name] for i, name in enumerate(hidden)}
+    weights = {f"{int(name.split('.')[1]) // 2}.{name.split('.')[2]}": state_dict[name] for name in hidden}
     weights |= {name: state_dict[name] for name in ("mu.weight", "mu.bias", "log_std.weight", "log_std.bias")}
+    first = weights["0.weight"].astype(np.float64) / scale
+    weights |= {"0.weight": first, "0.bias": weights["0.bias"] - (first * offset).sum(axis=1)}
     return {name: np.asarray(array, dtype=np.float32) for name, array in weights.items()}
 
 
@@ -69,3 +79,81 @@ def load_actor(path: str | os.PathLike[str]) -> SacActor:
         raise DatasetError(
             path, "weights", f"cannot be read ({error})", "Name a file written by sb3-offline train-sac"
         ) from error
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """
+    One actor of a task, and how it did when its actions were sampled.
+
+    :param file: path of its weights
+    :param sha256: of the file
+    :param step: decisions trained
+    :param successes: solved episodes
+    :param episodes: of so many
+    """
+
+    file: Path
+    sha256: str
+    step: int
+    successes: int
+    episodes: int
+
+    @property
+    def success_rate(self) -> float:
+        """:return: share of solved episodes"""
+        return self.successes / self.episodes
+
+
+def load_policies(folder: str | os.PathLike[str]) -> dict[str, list[Checkpoint]]:
+    """
+    :param folder: with ``policies.json`` and the files it names, as ``sb3-offline export-sac`` writes it
+    :return: checkpoints by task, in the order of training; raises ``DatasetError`` for a file that was not measured
+    """
+    path = Path(folder) / "policies.json"
+    remedy = "Name a folder written by sb3-offline export-sac"
+    try:
+        tasks = json.loads(path.read_text())["tasks"]
+    except (OSError, KeyError, ValueError) as error:
+        raise DatasetError(path, "file", f"cannot be read ({error})", remedy) from error
+    policies = {}
+    for task, entry in tasks.items():
+        policies[task] = [Checkpoint(**{**values, "file": path.parent / values["file"]}) for values in entry["checkpoints"]]
+        for checkpoint in policies[task]:
+            if file_sha256(checkpoint.file) != checkpoint.sha256:
+                raise DatasetError(checkpoint.file, "sha256", "is not the one in policies.json", remedy)
+    return policies
+
+
+def file_sha256(path: str | os.PathLike[str]) -> str:
+    """
+    :param path: of a small file
+    :return: hexadecimal digest, "" where there is no such file
+    """
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest() if Path(path).exists() else ""
+
+
+def mix_weights(success_rates: Sequence[float], share: float) -> np.ndarray:
+    """
+    The most even mix of checkpoints whose expected success is `share`: of all such weights, those with the greatest entropy.
+    They are proportional to ``exp(k * success_rate)``.
+
+    :param success_rates: (n,) of the checkpoints, measured
+    :param share: of successful episodes in the data
+    :return: (n,) float64, how often to take each; raises ``ValueError`` where the checkpoints cannot be mixed to that share
+    """
+    rates = np.asarray(success_rates, dtype=np.float64)
+    if not rates.min() < share < rates.max():
+        raise ValueError(
+            f"Checkpoints with success rates of {rates.min():.2f} to {rates.max():.2f} cannot be mixed to {share:.2f}."
+        )
+
+    def weights(k: float) -> np.ndarray:
+        unnormalised = np.exp(k * (rates - rates.max() if k > 0 else rates - rates.min()))
+        return unnormalised / unnormalised.sum()
+
+    low, high = -1e3, 1e3
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if weights(middle) @ rates < share else (low, middle)
+    return weights(low)

@@ -23,10 +23,13 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
 from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.envs.multimodal_metaworld import TASKS
+from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
+from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
 
 SLICE = 5_000
 """Decisions between two evaluations: whole episodes."""
@@ -43,12 +46,15 @@ _BASE: dict[str, Any] = {
     "learning_starts": 2_000,
     "buffer_size": 250_000,
 }
-SETTINGS = {
+_EXPLORE: dict[str, Any] = {**_BASE, "scaled_states": True, "target_entropy": -1.0, "ou_noise": 0.2}
+SETTINGS: dict[str, dict[str, Any]] = {
     "base": {**_BASE, "policy_kwargs": {"net_arch": [128, 128]}},
-    "n-step": {**_BASE, "n_steps": 3, "policy_kwargs": {"net_arch": [128, 128]}},
-    "wide": {**_BASE, "gamma": 0.98, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}},
+    "explore": {**_EXPLORE, "policy_kwargs": {"net_arch": [128, 128]}},
 }
-"""Arguments of SAC by name."""
+"""
+Arguments of SAC by name, and two of this program: `scaled_states`, whether the networks see the state shifted and scaled (the
+actors that are kept take it as it is); `ou_noise`, the scale of Ornstein-Uhlenbeck noise on the actions while training.
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +80,7 @@ def run(args: argparse.Namespace) -> None:
     with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
         for i in range(rounds):
             folders = [
-                args.output / task for task in args.tasks if not _is_done(_read_curve(args.output / task), (i + 1) * SLICE)
+                args.output / task for task in args.tasks if not _is_done(read_curve(args.output / task), (i + 1) * SLICE)
             ]
             for folder, row in zip(folders, pool.map(train_slice, folders), strict=True):
                 left = (time.time() - started) * (rounds - i - 1) / (i + 1) / 60
@@ -91,7 +97,11 @@ def _is_done(curve: list[dict[str, Any]], step: int) -> bool:
     return bool(curve) and (int(curve[-1]["step"]) >= step or solved[-2:] == [True, True])
 
 
-def _read_curve(folder: Path) -> list[dict[str, Any]]:
+def read_curve(folder: Path) -> list[dict[str, Any]]:
+    """
+    :param folder: of one task
+    :return: its evaluations so far, as texts
+    """
     path = folder / "curve.csv"
     if not path.exists():
         return []
@@ -104,11 +114,17 @@ def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -
     th.set_num_threads(1)
     th.set_flush_denormal(True)  # else, Adam's tiny moments slow the updates down
     began = time.process_time()
-    curve = _read_curve(folder)
+    curve = read_curve(folder)
     step = int(curve[-1]["step"]) if curve else 0
     (folder / "policies").mkdir(parents=True, exist_ok=True)
     index = TASKS.index(folder.name)
-    env = Monitor(gym.make(ENV_ID, task=folder.name, obs_type="state"))
+    plain_env = gym.make(ENV_ID, task=folder.name, obs_type="state")
+    arguments = {**SETTINGS[settings], "policy_kwargs": {**SETTINGS[settings]["policy_kwargs"]}}
+    offset, scale = _state_scaling(plain_env) if arguments.pop("scaled_states", False) else (0.0, 1.0)
+    env: gym.Env = Monitor(plain_env)
+    if np.ndim(scale):
+        space = gym.spaces.Box(-np.inf, np.inf, np.shape(scale), np.float32)
+        env = gym.wrappers.TransformObservation(env, lambda state: ((state - offset) / scale).astype(np.float32), space)
     slice_seed = int(np.random.SeedSequence((seed, index, step)).generate_state(1)[0] >> 1)
     if curve:
         state = folder / f"state_{step}"
@@ -116,16 +132,18 @@ def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -
         model.load_replay_buffer(state / "replay_buffer.pkl")
         model.set_random_seed(slice_seed)
     else:
-        arguments = {**SETTINGS[settings], "policy_kwargs": dict(SETTINGS[settings]["policy_kwargs"])}
         arguments["policy_kwargs"]["optimizer_kwargs"] = {"fused": True}
+        sigma = arguments.pop("ou_noise", 0.0)
+        if sigma:
+            arguments["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(4), np.full(4, sigma))
         model = SAC("MlpPolicy", env, seed=slice_seed, device="cpu", **arguments)
     model.learn(SLICE, reset_num_timesteps=False)
     step += SLICE
 
     state_dict = {name: tensor.numpy() for name, tensor in model.actor.state_dict().items()}
-    weights = actor_weights(state_dict)
+    weights = actor_weights(state_dict, offset, scale)
     np.savez(folder / "policies" / f"{step:06d}.npz", **weights)
-    successes, returns = evaluate_actor(SacActor(weights), env, n_eval_episodes)
+    successes, returns = evaluate_actor(SacActor(weights), plain_env, n_eval_episodes)
     row = {
         "step": step,
         "episodes": n_eval_episodes,
@@ -151,6 +169,16 @@ def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -
         if old != state:
             shutil.rmtree(old)
     return row
+
+
+def _state_scaling(env: gym.Env) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :return: (21,) the state at the start with everything at its nominal place; (21,) a decimetre, or half a radian
+    """
+    table: Any = env.unwrapped
+    table.scene.reset(np.zeros((len(BODY_POSITIONS), 2)))
+    scale = [0.5 if name.endswith(("angle", "opening")) else 0.1 for name in STATE_NAMES]
+    return table.get_state().astype(np.float64), np.array(scale)
 
 
 def evaluate_actor(
