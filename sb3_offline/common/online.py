@@ -1,0 +1,99 @@
+"""From offline to online: models that go on learning as Stable-Baselines3's own SAC."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.td3.policies import Actor as DeterministicActor
+
+from sb3_offline.common.actor_critic import ActorCriticAlgorithm
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, OfflinePolicy
+from sb3_offline.common.reward_based import RewardBasedAlgorithm
+from sb3_offline.data.mixed import MixedDictReplayBuffer, MixedReplayBuffer
+
+#: Standard deviation, before the tanh, of a policy that had none
+ADDED_STD = 0.1
+
+
+def export_sac(
+    model: OfflineAlgorithm,
+    path: str | os.PathLike,
+    *,
+    data_ratio: float = 0.0,
+    buffer_size: int = 1_000_000,
+    learning_starts: int = 0,
+    ent_coef: str | float = "auto_0.01",
+    **kwargs: Any,
+) -> None:
+    """
+    Save an actor-critic as a zip that ``SAC.load(path, env=env)`` of stock Stable-Baselines3 opens. Its ``predict`` is that
+    of the model. The policy class stays this library's, which is one of SAC's: the critic alone goes on training a shared
+    encoder, and observations are standardised as they were.
+
+    Critics of rewards are kept. Those of learners from examples are no values of rewards: SAC gets new ones, on the same
+    encoder. A deterministic actor gets a standard deviation of 0.1 before the tanh.
+
+    :param model: a trained actor-critic
+    :param path: the zip to write
+    :param data_ratio: share of each batch of SAC that comes from the model's dataset, which must have rewards; 0: none does
+    :param buffer_size: see :class:`stable_baselines3.sac.SAC`
+    :param learning_starts: environment steps of random actions; SAC's default, 100, would not play the policy at first
+    :param ent_coef: entropy coefficient; SAC's default, which starts at 1, would at first reward randomness more than anything
+    :param kwargs: further arguments of :class:`stable_baselines3.sac.SAC`; default: the model's learning rate, batch size,
+        ``tau``, ``gamma``, and seed
+    """
+    if not isinstance(model, ActorCriticAlgorithm):
+        remedy = "export an actor-critic, such as CQL, IQL, TD3BC or CEBORL"
+        raise TypeError(f"{type(model).__name__} has no critic that SAC could go on with; {remedy}")
+    keeps_critic = isinstance(model, RewardBasedAlgorithm)
+    policy_kwargs = {k: v for k, v in model.policy_kwargs.items() if k != "critic_state_value"}
+    if not keeps_critic:
+        policy_kwargs.pop("critic_output_bias", None)
+    arguments = {name: getattr(model, name) for name in ("learning_rate", "batch_size", "tau", "gamma", "device")}
+    seed = kwargs.pop("seed", model.seed)  # not to the constructor, which would reseed all generators here
+    sac = SAC(
+        _policy_class(model.policy),
+        model.get_env(),  # type: ignore[arg-type]
+        buffer_size=1,  # none is allocated here
+        learning_starts=learning_starts,
+        ent_coef=ent_coef,
+        policy_kwargs=policy_kwargs,
+        **{**arguments, **kwargs},
+    )
+    _copy_weights(model.policy, sac.policy, keeps_critic)  # type: ignore[arg-type]
+    sac.buffer_size, sac.seed = buffer_size, seed
+    if data_ratio > 0:
+        is_dict = isinstance(model.observation_space, spaces.Dict)
+        sac.replay_buffer_class = MixedDictReplayBuffer if is_dict else MixedReplayBuffer
+        sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
+    sac.save(Path(path))
+
+
+def _policy_class(policy: OfflinePolicy) -> type[OfflinePolicy]:
+    if not isinstance(policy.actor, DeterministicActor):
+        return type(policy)
+    classes = (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    return next(c for c in classes if c.default_features_extractor_class is policy.default_features_extractor_class)
+
+
+@th.no_grad()
+def _copy_weights(source: OfflinePolicy, target: OfflinePolicy, keeps_critic: bool) -> None:
+    wanted = target.state_dict()
+    weights = {name: value for name, value in source.state_dict().items() if name in wanted}
+    if isinstance(source.actor, DeterministicActor):
+        layers = [layer for layer in source.actor.mu if isinstance(layer, th.nn.Linear)]
+        copies = [layer for layer in target.actor.latent_pi if isinstance(layer, th.nn.Linear)] + [target.actor.mu]
+        for layer, copy in zip(layers, copies, strict=True):
+            copy.load_state_dict(layer.state_dict())  # type: ignore[union-attr]
+        target.actor.log_std.weight.zero_()  # type: ignore[union-attr, operator]
+        target.actor.log_std.bias.fill_(th.tensor(ADDED_STD).log())  # type: ignore[union-attr, operator]
+        weights = {name: value for name, value in weights.items() if not name.startswith(("actor.mu", "actor.log_std"))}
+    if not keeps_critic:
+        weights = {name: value for name, value in weights.items() if not name.startswith(("critic.qf", "critic_target.qf"))}
+    target.load_state_dict(weights, strict=False)
+    if not keeps_critic:
+        target.critic_target.load_state_dict(target.critic.state_dict())

@@ -1,0 +1,61 @@
+"""Replay buffers in which the steps of a dataset are mixed with those of an environment."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, TensorDict
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import DatasetSource
+
+
+class _Mixed:
+    def __init__(self, *args: Any, dataset: DatasetSource, data_ratio: float = 0.5, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        if not 0 <= data_ratio <= 1:
+            raise DatasetError("", "data_ratio", f"is {data_ratio}", "Give the share of a batch that the dataset has, 0 to 1")
+        self.data_ratio = data_ratio
+        self.offline = OfflineReplayBuffer(dataset, self.observation_space, self.action_space, self.device)  # type: ignore
+        if not self.offline.has_rewards:
+            problem, remedy = "are missing, but a learner from rewards asks for them", "Give a dataset with rewards"
+            raise DatasetError(self.offline.datasets[0].path, "rewards", problem, remedy)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        :param batch_size: number of transitions
+        :param env: normalises observations and rewards
+        :return: ``round(data_ratio * batch_size)`` transitions of the dataset (all, while there are no others), then those of
+            the environment
+        """
+        n_data = round(self.data_ratio * batch_size) if self.size() else batch_size  # type: ignore[attr-defined]
+        parts = [self.offline.sample(n_data, env)[:5]] if n_data else []
+        if n_data < batch_size:
+            parts.append(super().sample(batch_size - n_data, env)[:5])  # type: ignore[misc]
+        return ReplayBufferSamples(*(_joined(fields) for fields in zip(*parts, strict=True)))  # type: ignore[arg-type]
+
+
+def _joined(fields: tuple[Any, ...]) -> th.Tensor | TensorDict:
+    if isinstance(fields[0], dict):
+        return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
+    return th.cat(fields)
+
+
+class MixedReplayBuffer(_Mixed, ReplayBuffer):
+    """
+    A ``ReplayBuffer`` whose batches hold transitions of a dataset, in a stated ratio, beside those that were added to it::
+
+        SAC("MlpPolicy", env, replay_buffer_class=MixedReplayBuffer,
+            replay_buffer_kwargs={"dataset": "data.h5", "data_ratio": 0.5})
+
+    :param args: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
+    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these; with rewards
+    :param data_ratio: share of each batch that comes from the dataset
+    :param kwargs: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
+    """
+
+
+class MixedDictReplayBuffer(_Mixed, DictReplayBuffer):  # type: ignore[misc]
+    """:class:`MixedReplayBuffer` for dict observations."""
