@@ -31,8 +31,6 @@ from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
 
-SLICE = 5_000
-"""Decisions between two evaluations: whole episodes."""
 SOLVED = 0.9
 """Training stops when this share of evaluation episodes has been reached twice in a row."""
 EVAL_SEED = 1_000_000
@@ -66,7 +64,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
     parser.add_argument("--settings", choices=list(SETTINGS), default="base")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--eval-episodes", type=int, default=20, help=f"after every {SLICE:,} decisions")
+    parser.add_argument(
+        "--eval-freq", type=int, default=5_000, help="decisions of a slice: whole episodes of 50 (default: 5000)"
+    )
+    parser.add_argument("--eval-episodes", type=int, default=20, help="after every slice")
     parser.add_argument(
         "--workers", type=int, default=1, help="processes of one thread; the result is the same for any number"
     )
@@ -74,13 +75,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    train_slice = functools.partial(_train_slice, settings=args.settings, seed=args.seed, n_eval_episodes=args.eval_episodes)
-    started, rounds = time.time(), -(-args.n_timesteps // SLICE)
+    train_slice = functools.partial(
+        _train_slice, settings=args.settings, seed=args.seed, n_decisions=args.eval_freq, n_eval_episodes=args.eval_episodes
+    )
+    started, rounds = time.time(), -(-args.n_timesteps // args.eval_freq)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
         for i in range(rounds):
             folders = [
-                args.output / task for task in args.tasks if not _is_done(read_curve(args.output / task), (i + 1) * SLICE)
+                args.output / task
+                for task in args.tasks
+                if not _is_done(read_curve(args.output / task), (i + 1) * args.eval_freq)
             ]
             for folder, row in zip(folders, pool.map(train_slice, folders), strict=True):
                 left = (time.time() - started) * (rounds - i - 1) / (i + 1) / 60
@@ -109,7 +114,7 @@ def read_curve(folder: Path) -> list[dict[str, Any]]:
         return list(csv.DictReader(file))
 
 
-def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -> dict[str, Any]:
+def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eval_episodes: int) -> dict[str, Any]:
     """Train the task that the folder is named after for one more slice; the new curve.csv makes the slice count."""
     th.set_num_threads(1)
     th.set_flush_denormal(True)  # else, Adam's tiny moments slow the updates down
@@ -137,8 +142,8 @@ def _train_slice(folder: Path, settings: str, seed: int, n_eval_episodes: int) -
         if sigma:
             arguments["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(4), np.full(4, sigma))
         model = SAC("MlpPolicy", env, seed=slice_seed, device="cpu", **arguments)
-    model.learn(SLICE, reset_num_timesteps=False)
-    step += SLICE
+    model.learn(n_decisions, reset_num_timesteps=False)
+    step += n_decisions
 
     state_dict = {name: tensor.numpy() for name, tensor in model.actor.state_dict().items()}
     weights = actor_weights(state_dict, offset, scale)

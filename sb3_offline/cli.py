@@ -4,16 +4,15 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 ENV_ID = "MultimodalMetaworld-v0"
 
 
 def main(argv: list[str] | None = None) -> None:
     """:param argv: the command line, default ``sys.argv``"""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
     try:
+        arguments = _parser(argv[:1]).parse_args(argv)
         arguments.run(arguments)
     except (RuntimeError, ValueError, FileExistsError) as error:
         sys.exit(f"sb3-offline: {error}")
@@ -24,27 +23,38 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(f'sb3-offline: {error}; install it with: pip install "sb3-offline[{extra}]"')
 
 
-_EXTRAS = {"metaworld": "metaworld", "mujoco": "metaworld", "matplotlib": "plots", "minari": "minari", "pyarrow": "imitation"}
+_EXTRAS = {
+    "metaworld": "metaworld",
+    "mujoco": "metaworld",
+    "matplotlib": "plots",
+    "minari": "minari",
+    "pyarrow": "imitation",
+    "ray": "ray",
+}
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(chosen: list[str]) -> argparse.ArgumentParser:
+    """:param chosen: the command whose options are wanted: those of others import what may not be installed"""
     parser = argparse.ArgumentParser(prog="sb3-offline", description="Offline reinforcement learning for Stable-Baselines3")
     commands = parser.add_subparsers(required=True, metavar="command")
-    _add(commands, "collect", "roll out the scripted policies, with noise and aborted attempts", _collect)
-    _add(commands, "train-sac", "train stock SB3 SAC on each task from states, the agents that collect", _tool("train_sac"))
-    _add(commands, "examples", "take success examples out of a labelled dataset", _tool("extract_examples"))
-    _add(commands, "inspect", "say what is in a dataset and what looks wrong", _tool("inspect_dataset"))
-    _add(commands, "render", "draw the frames of a dataset anew, of another size or camera", _tool("render_dataset"))
-    _add(commands, "convert", "compress a dataset, lay it out raw, or take over another library's", _tool("convert_dataset"))
-    _add(commands, "train", "train one policy", _train)
-    _add(commands, "evaluate", "play a trained policy", _evaluate)
-    _add(commands, "demo", "collect, train, evaluate and report, all by itself", _demo)
+
+    def add(name: str, text: str, setup: Callable[[argparse.ArgumentParser], Callable]) -> None:
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if name in chosen:
+            command.set_defaults(run=setup(command))
+
+    add("collect", "roll out the scripted policies, with noise and aborted attempts", _collect)
+    add("collect-sac", "roll out trained SAC agents: data like the paper's", _tool("collect_sac"))
+    add("train-sac", "train the agents that collect-sac rolls out", _tool("train_sac"))
+    add("export-sac", "choose and measure checkpoints of train-sac for collect-sac", _tool("export_sac"))
+    add("examples", "take success examples out of a labelled dataset", _tool("extract_examples"))
+    add("inspect", "say what is in a dataset and what looks wrong", _tool("inspect_dataset"))
+    add("render", "draw the frames of a dataset anew, of another size or camera", _tool("render_dataset"))
+    add("convert", "compress a dataset, lay it out raw, or take over another library's", _tool("convert_dataset"))
+    add("train", "train one policy", _train)
+    add("evaluate", "play a trained policy", _evaluate)
+    add("demo", "collect, train, evaluate and report, all by itself", _demo)
     return parser
-
-
-def _add(commands: Any, name: str, text: str, setup: Callable[[argparse.ArgumentParser], Callable]) -> None:
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    parser.set_defaults(run=setup(parser))
 
 
 def _tool(name: str) -> Callable[[argparse.ArgumentParser], Callable]:

@@ -1,0 +1,93 @@
+"""Choose checkpoints of trained SAC agents, measure how often they succeed, and leave them as `collect-sac` takes them."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import importlib.metadata
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data_tools.rollout import ENV_ID, versions
+from sb3_offline.data_tools.sac_policies import file_sha256, load_actor
+from sb3_offline.data_tools.train_sac import SETTINGS, evaluate_actor, read_curve
+from sb3_offline.data_tools.workers import map_in_order
+from sb3_offline.envs.multimodal_metaworld import TASKS
+
+MEASURE_SEED = 2_000_000
+"""Episodes that neither training's evaluation nor the collection uses."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """:param parser: gets the options of ``run``"""
+    parser.add_argument(
+        "runs", nargs="+", type=Path, help="folders of train-sac; a later one's task replaces an earlier one's"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for policies.json and the weights")
+    parser.add_argument("--checkpoints", type=int, default=6, help="per task (default: 6)")
+    parser.add_argument("--episodes", type=int, default=300, help="to measure each one with (default: 300)")
+    parser.add_argument("--workers", type=int, default=2)
+
+
+def run(args: argparse.Namespace) -> None:
+    """:param args: what ``add_arguments`` asks for"""
+    folders = {task: folder for run in args.runs for task in TASKS if (folder := run / task / "curve.csv").exists()}
+    if not folders:
+        raise DatasetError(args.runs[0], "curve.csv", "is in no task's folder", "Run sb3-offline train-sac first")
+    jobs = [(task, path) for task, curve in folders.items() for path in choose_checkpoints(curve.parent, args.checkpoints)]
+    measured = map_in_order(functools.partial(_measure, n_episodes=args.episodes), jobs, args.workers)
+    args.output.mkdir(parents=True, exist_ok=True)
+    tasks: dict[str, Any] = {task: _provenance(curve.parent) for task, curve in folders.items()}
+    for (task, path), successes in zip(jobs, measured, strict=True):
+        name = f"{task}_{path.name}"
+        shutil.copyfile(path, args.output / name)
+        checkpoint = {"file": name, "sha256": file_sha256(path), "step": int(path.stem)}
+        tasks[task]["checkpoints"].append({**checkpoint, "successes": successes, "episodes": args.episodes})
+        print(f"{task:<12} after {int(path.stem):>7} decisions: {successes} of {args.episodes} solved", flush=True)
+    kept = {checkpoint["file"] for entry in tasks.values() for checkpoint in entry["checkpoints"]}
+    for old in args.output.glob("*.npz"):
+        if old.name not in kept:
+            old.unlink()
+    (args.output / "policies.json").write_text(json.dumps({"env_id": ENV_ID, "tasks": tasks}, indent=2) + "\n")
+
+
+def choose_checkpoints(folder: Path, n: int) -> list[Path]:
+    """
+    :param folder: of a task, as train-sac leaves it
+    :param n: how many
+    :return: of its checkpoints, those nearest to n equal parts of the training, the last one among them
+    """
+    steps = [int(row["step"]) for row in read_curve(folder)]
+    places = np.unique(np.ceil(len(steps) * np.arange(1, n + 1) / n).astype(int) - 1)
+    return [folder / "policies" / f"{steps[i]:06d}.npz" for i in places]
+
+
+def _measure(job: tuple[str, Path], n_episodes: int) -> int:
+    task, path = job
+    successes, _ = evaluate_actor(load_actor(path), _env(task), n_episodes, seed=MEASURE_SEED, sample=True)
+    return int(successes.sum())
+
+
+@functools.lru_cache(maxsize=1)
+def _env(task: str) -> gym.Env:
+    return gym.make(ENV_ID, task=task, obs_type="state")
+
+
+def _provenance(folder: Path) -> dict[str, Any]:
+    curve = read_curve(folder)
+    learners = {name: importlib.metadata.version(name) for name in ("stable_baselines3", "torch")}
+    return {
+        "algorithm": "stable_baselines3.SAC, MlpPolicy, state observations",
+        "settings": SETTINGS[curve[-1]["settings"]],
+        "seed": int(curve[-1]["seed"]),
+        "trained_decisions": int(curve[-1]["step"]),
+        "commit": curve[-1]["commit"],
+        "versions": {**versions(), **learners},
+        "checkpoints": [],
+    }
