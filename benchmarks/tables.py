@@ -23,7 +23,22 @@ def table(path: Path) -> str:
         rows = list(csv.DictReader(file))
     if "change" in rows[0]:
         return checkpoint_table(rows)
+    if "bound_holds" in rows[0]:
+        return world_table(rows)
     return rate_table(rows) if "commit" in rows[0] else result_table(rows)
+
+
+def world_table(rows: list[dict[str, str]]) -> str:
+    """A row a variant of benchmarks/small_world.py."""
+    lines = [
+        "| variant | learned | true | largest learned / true | states above the bound | bound |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        ratio, share = float(row["largest_ratio"]), float(row["states_above_bound"])
+        cells = [row["variant"], row["learned_at_start"], row["true_at_start"], f"{ratio:.4g}", f"{share:.0%}"]
+        lines.append(f"| {' | '.join(cells)} | {'holds' if row['bound_holds'] == 'True' else 'broken'} |")
+    return "\n".join(lines)
 
 
 def rate_table(rows: list[dict[str, str]]) -> str:
