@@ -16,6 +16,8 @@ from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.common.torch_layers import StandardizedExtractor
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.experiment.config import load_config
+from sb3_offline.experiment.training import create_model
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -148,6 +150,15 @@ def test_callbacks_logger_and_evaluation(algo, files, tmp_path):
     assert evaluate_policy(model, env, n_eval_episodes=2)[0] == 5.0
     model.learn(100, callback=CountSteps(stop_at=14), reset_num_timesteps=False)
     assert model.num_timesteps == 14
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_shipped_configs_fit_their_algorithm(algo, files):
+    for name, policy in ((algo, "MlpPolicy"), (f"{algo}_pixels", "CnnPolicy")):
+        config = load_config(name, "default")
+        assert config["policy"] == policy
+        dataset, examples = files[policy]
+        create_model(algo, config, dataset, examples if needs_examples(algo) else None)
 
 
 def test_no_environment_says_so(files):

@@ -1,9 +1,11 @@
 """Losses of the reward-based algorithms against plain NumPy float64 readings (to 1e-5), and where their rewards come from."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
-from data_files import ACTIONS, make_observations, write_dataset
+from data_files import ACTIONS, make_episode, make_observations, write_dataset
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -19,7 +21,7 @@ from sb3_offline.oril.losses import classifier_loss
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 BOTH = spaces.Dict({"image": IMAGES, "state": STATES})
-SMALL = {"net_arch": [16, 16]}
+SMALL = {"net_arch": [16, 16], "mixed_precision": False}
 RNG = np.random.default_rng(0)
 EXAMPLES = RNG.normal(size=(20, 3)).astype(np.float32)
 
@@ -166,6 +168,9 @@ def test_rewards_of_a_function_take_the_place_of_the_datasets(algorithm, folder,
     np.testing.assert_array_equal(algorithm.load(tmp_path / "model").replay_buffer.rewards, model.replay_buffer.rewards)
     model.reward_fn = lambda batch: np.full(len(batch.actions), 7.0)
     assert (model.replay_buffer.rewards == 7).all()
+    model.reward_fn = "success"
+    labels = [episode["success"] for episode in map(partial(make_episode, space=STATES), range(12))]
+    np.testing.assert_array_equal(model.replay_buffer.rewards, np.concatenate(labels))
 
 
 def test_long_data_are_relabelled_in_pieces(folder):
@@ -185,6 +190,10 @@ def test_missing_and_broken_rewards_are_named(folder, tmp_path):
         writer.add_episode(make_observations(STATES, 5, RNG), np.stack([ACTIONS.sample() for _ in range(4)]))
     with pytest.raises(DatasetError, match=r"none\.h5: rewards: is missing.*reward_fn"):
         CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL).learn(1)
+    with pytest.raises(DatasetError, match=r"none\.h5: success: is missing"):
+        CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL, reward_fn="success").learn(1)
+    with pytest.raises(TypeError, match="reward_fn is 'succes'"):
+        CQL("MlpPolicy", None, with_none, reward_fn="succes")
     CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL, reward_fn=lambda batch: th.ones(len(batch.dones), 1)).learn(1)
     for broken in (lambda batch: batch.actions, lambda batch: batch.rewards * np.nan, lambda batch: 1.0):
         model = CQL("MlpPolicy", None, folder / "states.h5", policy_kwargs=SMALL, reward_fn=broken)

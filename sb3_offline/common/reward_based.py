@@ -12,8 +12,8 @@ from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetSource
 
-#: Rewards ``(batch,)`` of a batch of transitions.
-RewardFunction = Callable[[OfflineSamples], Any]
+#: Rewards ``(batch,)`` of a batch of transitions; or ``"success"``, the success labels of the dataset.
+RewardFunction = Callable[[OfflineSamples], Any] | str
 
 
 class RewardBasedAlgorithm(ActorCriticAlgorithm):
@@ -27,7 +27,7 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
         dataset's. It is called once for each transition, when the dataset is opened, with an
         :class:`~sb3_offline.data.buffer.OfflineSamples` (``observations``, ``actions`` scaled to [-1, 1],
         ``next_observations``, ``dones``, ``rewards`` of the dataset, as tensors on the model's device), and is saved with
-        the model.
+        the model. ``"success"`` takes the dataset's success labels, 0 or 1, for rewards.
     :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     """
 
@@ -40,6 +40,8 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
         **kwargs: Any,
     ):
         super().__init__(policy, env, dataset, **kwargs)
+        if isinstance(reward_fn, str) and reward_fn != "success":
+            raise TypeError(f"{type(self).__name__}: reward_fn is {reward_fn!r}; give a function, or 'success'")
         self.reward_fn = reward_fn
 
     def _data_sources(self) -> tuple[Any, ...]:
@@ -51,11 +53,14 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
 
     def _relabel(self) -> None:
         """Put the rewards that are learned from in place of the dataset's."""
-        if self.reward_fn is not None:
-            self.replay_buffer.relabel(self.reward_fn)
-        elif not self.replay_buffer.has_rewards:
+        buffer = self.replay_buffer
+        if callable(self.reward_fn):
+            buffer.relabel(self.reward_fn)
+        elif self.reward_fn is not None:
+            buffer.rewards = buffer.success_rewards()
+        elif not buffer.has_rewards:
             remedy = "Record rewards, or say what they are: reward_fn=..."
-            raise DatasetError(self.replay_buffer.datasets[0].path, "rewards", "is missing", remedy)
+            raise DatasetError(buffer.datasets[0].path, "rewards", "is missing", remedy)
 
     def _returns(self, batch: OfflineSamples) -> tuple[th.Tensor, th.Tensor, PyTorchObs]:
         """

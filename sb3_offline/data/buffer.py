@@ -233,7 +233,17 @@ class OfflineReplayBuffer(ReplayBuffer):
     @property
     def has_rewards(self) -> bool:
         """Whether the files hold rewards."""
-        return "rewards" in self.datasets[0].arrays
+        return self.datasets[0].rewards is not None
+
+    def success_rewards(self) -> np.ndarray:
+        """
+        :return: (N,) float32, 1 for the steps after which the files' labels say success; raises ``DatasetError`` where they
+            hold none
+        """
+        for dataset in self.datasets:
+            if dataset.success is None:
+                raise DatasetError(dataset.path, "success", "is missing: the file has no success labels", "Give other rewards")
+        return self._concatenate("success").astype(np.float32)
 
     def relabel(
         self, reward_fn: Callable[[OfflineSamples], Any], env: VecNormalize | None = None, batch_size: int = 512
