@@ -10,11 +10,9 @@ from __future__ import annotations
 import argparse
 import csv
 import functools
-import multiprocessing
 import shutil
 import subprocess
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,10 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
+from sb3_offline.data.errors import DatasetError
 from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
+from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
-    parser.add_argument("--settings", choices=list(SETTINGS), default="base")
+    parser.add_argument("--settings", choices=list(SETTINGS), default="explore")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--eval-freq", type=int, default=5_000, help="decisions of a slice: whole episodes of 50 (default: 5000)"
@@ -75,25 +75,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    train_slice = functools.partial(
-        _train_slice, settings=args.settings, seed=args.seed, n_decisions=args.eval_freq, n_eval_episodes=args.eval_episodes
-    )
-    started, rounds = time.time(), -(-args.n_timesteps // args.eval_freq)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
-        for i in range(rounds):
-            folders = [
-                args.output / task
-                for task in args.tasks
-                if not _is_done(read_curve(args.output / task), (i + 1) * args.eval_freq)
-            ]
-            for folder, row in zip(folders, pool.map(train_slice, folders), strict=True):
-                left = (time.time() - started) * (rounds - i - 1) / (i + 1) / 60
-                print(
-                    f"{folder.name:<12} {row['step']:>8} decisions: {row['successes']} of {row['episodes']} solved, "
-                    f"return {row['mean_return']:7.1f}; at most {left:.0f} min left",
-                    flush=True,
-                )
+    train = functools.partial(_train_task, args)
+    folders = [args.output / task for task in args.tasks]
+    for folder, curve in zip(folders, map_in_order(train, folders, args.workers), strict=True):
+        best = max(curve, key=lambda row: int(row["successes"]))
+        print(f"{folder.name:<12} best after {best['step']} decisions: {best['successes']} of {best['episodes']} solved")
+
+
+def _train_task(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Train one task to its end, from wherever it is."""
+    curve = read_curve(folder)
+    first, started = int(curve[-1]["step"]) if curve else 0, time.time()
+    while not _is_done(curve, args.n_timesteps):
+        row = _train_slice(folder, args.settings, args.seed, args.eval_freq, args.eval_episodes)
+        left = (time.time() - started) * (args.n_timesteps - row["step"]) / (row["step"] - first) / 60
+        print(
+            f"{folder.name:<12} {row['step']:>8} decisions: {row['successes']} of {row['episodes']} solved, "
+            f"return {row['mean_return']:7.1f}; at most {left:.0f} min left",
+            flush=True,
+        )
+        curve = read_curve(folder)
+    return curve
 
 
 def _is_done(curve: list[dict[str, Any]], step: int) -> bool:
@@ -120,6 +122,9 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
     th.set_flush_denormal(True)  # else, Adam's tiny moments slow the updates down
     began = time.process_time()
     curve = read_curve(folder)
+    if curve and curve[-1]["settings"] != settings:
+        problem = f"holds a run with the settings {curve[-1]['settings']!r}"
+        raise DatasetError(folder / "curve.csv", "settings", problem, "Go on with these (--settings), or name another folder")
     step = int(curve[-1]["step"]) if curve else 0
     (folder / "policies").mkdir(parents=True, exist_ok=True)
     index = TASKS.index(folder.name)
