@@ -1,5 +1,6 @@
 """Losses of the reward-based algorithms against plain NumPy float64 readings (to 1e-5), and where their rewards come from."""
 
+import pickle
 from functools import partial
 
 import numpy as np
@@ -182,6 +183,7 @@ def test_long_data_are_relabelled_in_pieces(folder):
     assert max(sizes) == 7 and sum(sizes) == buffer.size() and len(sizes) > 2
     means = buffer.transitions(np.arange(buffer.size())).observations.float().mean(dim=(1, 2, 3))
     np.testing.assert_allclose(buffer.rewards, means, rtol=1e-5)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(buffer)).rewards, buffer.rewards)
 
 
 def test_missing_and_broken_rewards_are_named(folder, tmp_path):

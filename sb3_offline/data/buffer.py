@@ -58,7 +58,7 @@ class OfflineReplayBuffer(ReplayBuffer):
     A fixed ``ReplayBuffer`` over one or several dataset files.
 
     It samples uniformly over steps with its own random generator. Windows of several steps never cross an episode. It
-    pickles as its files' paths and its generator.
+    pickles as its files' paths, its generator, and its rewards where they were relabelled.
 
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these
     :param observation_space: the learner's space: as in the files, or with images channel-first
@@ -104,7 +104,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         lengths = np.concatenate([d.lengths for d in datasets])
         self._index_steps(lengths)
         self.actions = self._scaled_actions()
-        self.rewards = self._concatenate("rewards", np.zeros(n_steps_total, np.float32))
+        self.rewards = self._file_rewards = self._concatenate("rewards", np.zeros(n_steps_total, np.float32))
         self.dones = self._concatenate("terminated").astype(np.float32)
         self._stores, self.storage = observation_stores(datasets, storage)
         self.rng = np.random.default_rng(seed)
@@ -307,11 +307,13 @@ class OfflineReplayBuffer(ReplayBuffer):
     def __getstate__(self) -> dict[str, Any]:
         options = {"n_steps": self.n_steps, "gamma": self.gamma, "storage": self.storage, "next_actions": self.next_actions}
         arguments = (self.datasets, self.observation_space, self.action_space, str(self.device))
-        return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state()}
+        rewards = None if self.rewards is self._file_rewards else self.rewards  # relabelled ones are in no file
+        return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state(), "rewards": rewards}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(*state["arguments"], **state["options"])  # type: ignore[misc]
         self.set_rng_state(state["rng_state"])
+        self.rewards = self.rewards if state["rewards"] is None else state["rewards"]
 
 
 def _plain_shape(space: spaces.Space) -> tuple[int, ...]:
