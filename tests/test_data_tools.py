@@ -68,7 +68,7 @@ def test_an_interrupted_conversion_leaves_nothing(tmp_path, monkeypatch):
 def test_summary_of_a_sound_file(tmp_path, capsys):
     episodes = write_dataset(tmp_path / "a.h5", 30, env_id="Some-v0", provenance={"policy": "random"})
     cli.main(["inspect", "--json", str(tmp_path / "a.h5")])
-    (summary,) = json.loads(capsys.readouterr().out)
+    summary = json.loads(capsys.readouterr().out)
     left = [episode for episode in episodes if episode["source"] == "left"]
     group = summary["groups"]["left"]
     assert group["episodes"] == 15 and group["steps"] == sum(len(episode["actions"]) for episode in left)
@@ -102,17 +102,17 @@ def test_warnings_of_an_unsound_file(tmp_path):
     with h5py.File(path, "r+") as file:
         file["extras/noise"][3] = noise[3]
     summary = inspect_dataset.inspect_dataset(path)
-    text = "\n".join(summary["warnings"])
+    text = "\n".join(f"{warning['field']}: {warning['problem']}" for warning in summary["warnings"])
     for message in (
         "actions: 100.0% of the steps are outside",
         "success: no step is labelled",
-        "2 episodes end without either",
+        "terminated, truncated: 2 episodes end without either",
         "extras/noise: 1 rows hold NaN",
         "observations/state: never changes in 1 of 3 columns (1)",
         "observations/state: outside of the observation space in 1 columns (0)",
         "observations/image: 100.0% of 18 sampled images are of one colour",
         "rewards: never changes",
-        "1 episodes repeat an earlier one (1)",
+        "episodes: 1 repeat an earlier one (1)",
     ):
         assert message in text
         assert message in format_summary(summary)

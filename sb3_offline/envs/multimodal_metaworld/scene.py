@@ -33,6 +33,9 @@ JITTER = 0.015
 N_ARM_JOINTS = 9
 """Seven arm joints and two fingers come first in qpos and qvel."""
 
+SCENE_STATE = {"joints": slice(0, 15), "hand_target": slice(15, 18), "bodies": slice(18, 30)}
+"""What stands where in a scene state: qpos, the mocap position, and x and y of each of `BODY_POSITIONS`."""
+
 FINE_ARM_GROUP = 2
 """Geom group of the arm's own meshes: MuJoCo draws groups 0 to 2 unless told otherwise."""
 
