@@ -36,7 +36,7 @@ def dataset(tmp_path_factory):
 def make(algorithm, dataset, monkeypatch, **kwargs):
     """:return: a model with a target of its own, its fixed batch, and the list that its losses go to"""
     kwargs = {"gamma": GAMMA, "batch_size": 64, "seed": 0, "learning_rate": RATE, **kwargs}
-    model = algorithm("MlpPolicy", None, dataset, policy_kwargs={"net_arch": [16, 16]}, **kwargs)
+    model = algorithm("MlpPolicy", None, dataset, policy_kwargs={"net_arch": [16, 16], "mixed_precision": False}, **kwargs)
     batch, losses, optimize = model.replay_buffer.sample(64), [], model._optimize
     assert 0 < batch.dones.sum() < 64
     for parameter in model.critic_target.parameters():

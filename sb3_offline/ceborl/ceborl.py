@@ -191,17 +191,21 @@ class CEBORL(ExampleBasedAlgorithm):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             observations = self.augment(batch.observations)
             features = self.critic.encode(observations)
-            examples = self.augment(self.sample_examples())
-            example_features = self.critic.encode(examples)
+            examples, example_rows = self.sample_examples()
+            examples = self.augment(examples)
+            example_features = self.critic.encode(examples)[example_rows]
             policy_features = self._policy_features(observations, features)
             with th.no_grad():
-                example_actions, _ = self.actor.sample(self._policy_features(examples, example_features))
+                example_policy_features = self._policy_features(examples, example_features, example_rows)
+                example_actions, _ = self.actor.sample(example_policy_features)
                 discounted_omega = self._discounted_omega(batch)
-                example_omega = self._example_omega(examples, example_actions)
+                example_omega = self._example_omega(examples, example_rows, example_actions)
 
             # Eq. 10
-            data_logits = self.critic.values(features, batch.actions)
-            example_logits = self.critic.values(example_features, example_actions)
+            parts = [len(features), len(example_features)]
+            both_features = th.cat([features, example_features])
+            both_logits = self.critic.values(both_features, th.cat([batch.actions, example_actions]))
+            data_logits, example_logits = both_logits.split(parts, dim=1)
             term_c = recursive_loss(data_logits, discounted_omega)
             term_b = self._example_term(example_logits, example_omega)
             critic_loss = term_c + term_b
@@ -212,17 +216,15 @@ class CEBORL(ExampleBasedAlgorithm):
                 self._record(penalty=term_a, classifier_penalized=sampled_logits.sigmoid().mean())
             if self.policy_extraction == "weighted":
                 # The same classification without the action: its odds are the mean over the data's actions.
-                state_logits = self.critic.state_values(features)
-                critic_loss = critic_loss + recursive_loss(state_logits.unsqueeze(0), discounted_omega)
-                critic_loss = critic_loss + self._example_term(
-                    self.critic.state_values(example_features).unsqueeze(0), example_omega
-                )
+                state_logits, example_state_logits = self.critic.state_values(both_features).unsqueeze(0).split(parts, dim=1)
+                critic_loss = critic_loss + recursive_loss(state_logits, discounted_omega)
+                critic_loss = critic_loss + self._example_term(example_state_logits, example_omega)
             self._optimize(self.critic.optimizer, critic_loss)
 
             if self.policy_extraction == "weighted":
                 weights = advantage_weights(
                     data_logits.detach(),
-                    state_logits.detach(),
+                    state_logits.squeeze(0).detach(),
                     example_logits.detach(),
                     self.temperature,
                     self.advantage_floor,
@@ -261,11 +263,11 @@ class CEBORL(ExampleBasedAlgorithm):
         n_step = batch.nstep_discounts.squeeze(1) * self._omega(batch.nstep_observations, batch.nstep_actions)
         return 0.5 * (one_step + n_step)
 
-    def _example_omega(self, examples: PyTorchObs, actions: th.Tensor) -> th.Tensor | None:
+    def _example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor | None:
         """:return: ``gamma * omega`` of examples as their own successors, where they count among the data"""
         if self.example_share == 0:
             return None
-        target_logits = self.critic_target.values(self.critic_target.encode(examples), actions)
+        target_logits = self.critic_target.values(self.critic_target.encode(examples)[rows], actions)
         return self.gamma * success_odds(target_logits, self.omega_max)
 
     def _example_term(self, logits: th.Tensor, example_omega: th.Tensor | None) -> th.Tensor:

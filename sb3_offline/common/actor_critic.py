@@ -38,13 +38,24 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
-    def _policy_features(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
-        """The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own."""
-        return features.detach() if self.policy.share_features_extractor else self.actor.encode(observations)
+    def _policy_features(self, observations: PyTorchObs, features: th.Tensor, rows: th.Tensor | None = None) -> th.Tensor:
+        """
+        The critic's features, which the policy does not train; or the policy's own, where it has an encoder of its own.
+
+        :param observations: a batch
+        :param features: of the critic's encoder, ``(batch, features_dim)``
+        :param rows: of the observations, where ``features`` holds some of them several times
+        :return: ``(batch, features_dim)``
+        """
+        if self.policy.share_features_extractor:
+            return features.detach()
+        own = self.actor.encode(observations)
+        return own if rows is None else own[rows]
 
     def _update_target(self) -> None:
         if self._n_updates % self.target_update_interval == 0:
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            with th.no_grad():
+                th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
             # Running statistics of batch normalisation are copied, as in SB3's SAC.
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

@@ -22,15 +22,30 @@ def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) ->
     """
     if max_shift == 0:
         return images
-    height, width = images.shape[-2:]
-    rows = th.arange(height, device=images.device)
-    columns = th.arange(width, device=images.device)
+    max_shift = min(max_shift, *(size - 1 for size in images.shape[2:]))
     shifted = th.empty_like(images)
     for start in range(0, len(images), GROUP_SIZE):
         down, right = (int(offset) for offset in rng.integers(-max_shift, max_shift + 1, size=2))
-        group = images[start : start + GROUP_SIZE].index_select(2, (rows + down).clamp(0, height - 1))
-        shifted[start : start + GROUP_SIZE] = group.index_select(3, (columns + right).clamp(0, width - 1))
+        rows, columns = _overlap(images.shape[2], down), _overlap(images.shape[3], right)
+        group = shifted[start : start + GROUP_SIZE]
+        group[:, :, rows[0], columns[0]] = images[start : start + GROUP_SIZE, :, rows[1], columns[1]]
+        _repeat_edges(group, columns[0], dim=3)
+        _repeat_edges(group, rows[0], dim=2)
     return shifted
+
+
+def _overlap(size: int, offset: int) -> tuple[slice, slice]:
+    """:return: where the pixels go that stay inside, and where they come from"""
+    first, kept = max(-offset, 0), size - abs(offset)
+    return slice(first, first + kept), slice(first + offset, first + offset + kept)
+
+
+def _repeat_edges(images: th.Tensor, filled: slice, dim: int) -> None:
+    """Fill the margins before and after ``filled`` along a dimension with its first and last line."""
+    size = images.shape[dim]
+    for first, count, line in ((0, filled.start, filled.start), (filled.stop, size - filled.stop, filled.stop - 1)):
+        if count:
+            images.narrow(dim, first, count).copy_(images.narrow(dim, line, 1))
 
 
 def shift_observations(observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator) -> PyTorchObs:

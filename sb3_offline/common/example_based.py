@@ -51,12 +51,17 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         """
         return self._examples_at(slice(None))
 
-    def sample_examples(self) -> PyTorchObs:
+    def sample_examples(self) -> tuple[PyTorchObs, th.Tensor]:
         """
-        :return: ``example_batch_size`` success examples, drawn with replacement, like a batch of observations
+        ``example_batch_size`` success examples, drawn with replacement. There are often fewer of them than a batch holds, so
+        each that was drawn comes once: no image is encoded twice.
+
+        :return: the examples that were drawn, like a batch of observations, and for each place in the batch its row in them
         """
         n_examples = len(next(iter(self._loaded_examples().values())))
-        return self._examples_at(self.replay_buffer.rng.integers(n_examples, size=self.example_batch_size))
+        drawn = self.replay_buffer.rng.integers(n_examples, size=self.example_batch_size)
+        distinct, rows = np.unique(drawn, return_inverse=True)
+        return self._examples_at(distinct), th.as_tensor(rows, device=self.device)
 
     def _loaded_examples(self) -> dict[str, np.ndarray]:
         if self._example_arrays is None or self._example_source is not self.examples:

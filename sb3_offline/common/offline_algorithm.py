@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 
 from sb3_offline.common.augmentation import shift_observations
+from sb3_offline.common.process import prepare_process
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
@@ -252,6 +253,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         # SB3's own version resets the environment, which an offline learner must never do.
+        prepare_process()
         self.start_time = time.time_ns()
         if reset_num_timesteps:
             self.num_timesteps = 0

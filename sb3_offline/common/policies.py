@@ -20,8 +20,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
-from torch.nn import functional as F
 
+from sb3_offline.common.linear import has_fast_bfloat16, linear, run_layers
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
 # Actions of a dataset often sit exactly on the bounds, where atanh is infinite.
@@ -42,6 +42,7 @@ class OfflineActor(Actor):
         super().__init__(*args, **kwargs)
         self.std_min = std_min
         self.detach_encoder = detach_encoder
+        self.mixed_precision: bool | None = False
         self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -50,13 +51,15 @@ class OfflineActor(Actor):
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
-        :return: features, ``(batch, features_dim)``, cut from the graph where the encoder is the critic's
+        :return: features, ``(batch, features_dim)``, in the dtype that learning computes in, and cut from the graph where the
+            encoder is the critic's
         """
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
-            return self.extract_features(obs, self.features_extractor)
+            return _encode(self, obs)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        mean, log_std = self.gaussian_parameters(self.encode(obs))
+        # What plays is computed in full precision, whatever learning is.
+        mean, log_std = self.gaussian_parameters(self.extract_features(obs, self.features_extractor))
         return mean, log_std, {}
 
     def gaussian_parameters(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -64,8 +67,10 @@ class OfflineActor(Actor):
         :param features: ``(batch, features_dim)``
         :return: mean and log standard deviation of the Gaussian before tanh, each ``(batch, action_dim)``
         """
-        latent = self.latent_pi(features)
-        return self.mu(latent), th.clamp(self.log_std(latent), self.log_std_min, LOG_STD_MAX)  # type: ignore[operator]
+        latent = run_layers(list(self.latent_pi), features)
+        assert isinstance(self.mu, nn.Linear) and isinstance(self.log_std, nn.Linear)
+        mean, log_std = (linear(latent, layer.weight, layer.bias).to(layer.weight.dtype) for layer in (self.mu, self.log_std))
+        return mean, th.clamp(log_std, self.log_std_min, LOG_STD_MAX)
 
     def sample(self, features: th.Tensor, n_samples: int | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -140,17 +145,13 @@ class OfflineCritic(ContinuousCritic):
         output_bias: float = 0.0,
         state_value: bool = False,
     ):
-        super().__init__(
-            observation_space,
-            action_space,
-            net_arch,
-            features_extractor,
-            features_dim,
-            activation_fn,
-            normalize_images,
-            n_critics,
-            share_features_extractor,
+        # Not ContinuousCritic's constructor, which would build heads of its own first.
+        super(ContinuousCritic, self).__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
+        self.share_features_extractor = share_features_extractor
+        self.n_critics = n_critics
+        self.mixed_precision: bool | None = False
         modules: list[type[nn.Module]] = [nn.LayerNorm] if layer_norm else []
         input_dims = {f"qf{idx}": features_dim + get_action_dim(action_space) for idx in range(n_critics)}
         if state_value:
@@ -164,9 +165,9 @@ class OfflineCritic(ContinuousCritic):
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
-        :return: features, ``(batch, features_dim)``
+        :return: features, ``(batch, features_dim)``, in the dtype that learning computes in
         """
-        return self.extract_features(obs, self.features_extractor)
+        return _encode(self, obs)
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -179,28 +180,48 @@ class OfflineCritic(ContinuousCritic):
         :param actions: ``(batch, action_dim)``, or ``(batch, K, action_dim)``, in [-1, 1]
         :return: ``(n_critics, batch)``, or ``(n_critics, batch, K)``
         """
-        many = actions.dim() == 3
+        actions = actions.to(features.dtype)
+        if actions.dim() == 2:
+            pairs = th.cat([features, actions], dim=1)
+            outputs = [run_layers(list(q_net), pairs).squeeze(1) for q_net in self.q_networks]  # type: ignore[call-overload]
+            return th.stack(outputs).to(self._parameter_dtype)
+        samples = actions.transpose(0, 1)  # (K, batch, .): what depends on states alone is added along whole rows
         outputs = []
         for q_net in self.q_networks:
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
-            first = q_net[0]
-            if many:
-                state_weight, action_weight = first.weight.split([features.shape[1], actions.shape[-1]], dim=1)
-                hidden = F.linear(features, state_weight, first.bias).unsqueeze(1) + F.linear(actions, action_weight)
-                outputs.append(q_net[1:](hidden.flatten(0, 1)).view(actions.shape[:2]))
-            else:
-                outputs.append(q_net(th.cat([features, actions], dim=1)).squeeze(1))
-        return th.stack(outputs)
+            state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
+            of_state = linear(features, state_weight, q_net[0].bias)
+            hidden = linear(samples.flatten(0, 1), action_weight).unflatten(0, samples.shape[:2]) + of_state
+            outputs.append(run_layers(list(q_net)[1:], hidden.flatten(0, 1)).view(samples.shape[:2]))
+        return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
         """
         :param features: ``(batch, features_dim)``
         :return: output of the state head, ``(batch,)``
         """
-        return self.get_submodule("vf")(features).squeeze(1)
+        head = self.get_submodule("vf")
+        assert isinstance(head, nn.Sequential)
+        return run_layers(list(head), features).squeeze(1).to(self._parameter_dtype)
+
+    @property
+    def _parameter_dtype(self) -> th.dtype:
+        return next(self.q_networks[0].parameters()).dtype
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
+
+
+def _encode(module: OfflineActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
+    """Features of observations; all that is computed from them keeps their dtype, so it is chosen here."""
+    encoder, device = module.features_extractor, module.device
+    bfloat16 = has_fast_bfloat16(device) if module.mixed_precision is None else module.mixed_precision
+    with th.autocast(device.type, th.bfloat16, enabled=bfloat16):
+        if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
+            features = encoder(obs)  # scales bytes by itself, which is cheaper than SB3's preprocessing
+        else:
+            features = module.extract_features(obs, encoder)
+    return features.bfloat16() if bfloat16 else features
 
 
 class OfflinePolicy(SACPolicy):
@@ -216,6 +237,9 @@ class OfflinePolicy(SACPolicy):
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
     :param critic_output_bias: what the critics put out at first, everywhere
     :param critic_state_value: add a critic of states alone
+    :param mixed_precision: learn with matrix products and convolutions in bfloat16, or in float32; ``None`` takes bfloat16
+        where the device has instructions for it. Parameters, losses, the optimizers' state, and the policy when it plays, are
+        in float32 in any case.
     :param features_extractor_class: encoder of the observations (default: that of the class)
     :param kwargs: all other arguments of :class:`stable_baselines3.sac.policies.SACPolicy`: ``net_arch``, ``activation_fn``,
         ``features_extractor_class``, ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
@@ -236,10 +260,12 @@ class OfflinePolicy(SACPolicy):
         critic_layer_norm: bool = False,
         critic_output_bias: float = 0.0,
         critic_state_value: bool = False,
+        mixed_precision: bool | None = None,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ):
         self.std_min = std_min
+        self.mixed_precision = mixed_precision
         self.offline_critic_kwargs: dict[str, Any] = {
             "layer_norm": critic_layer_norm,
             "output_bias": critic_output_bias,
@@ -271,21 +297,27 @@ class OfflinePolicy(SACPolicy):
         self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
-        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+        defaults = {"fused": True} if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **{**defaults, **self.optimizer_kwargs})  # type: ignore
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineActor:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return OfflineActor(**actor_kwargs, std_min=self.std_min, detach_encoder=self.share_features_extractor).to(self.device)
+        actor = OfflineActor(**actor_kwargs, std_min=self.std_min, detach_encoder=self.share_features_extractor)
+        actor.mixed_precision = self.mixed_precision
+        return actor.to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineCritic:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return OfflineCritic(**critic_kwargs, **self.offline_critic_kwargs).to(self.device)
+        critic = OfflineCritic(**critic_kwargs, **self.offline_critic_kwargs)
+        critic.mixed_precision = self.mixed_precision
+        return critic.to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(
             share_features_extractor=self.share_features_extractor,
             std_min=self.std_min,
+            mixed_precision=self.mixed_precision,
             **{f"critic_{name}": value for name, value in self.offline_critic_kwargs.items()},
         )
         return data

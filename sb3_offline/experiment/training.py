@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -175,8 +174,6 @@ def train(
     :return: the trained model
     """
     record = run_record(algo, env_id, config, dataset=dataset, examples=examples, env_kwargs=env_kwargs, seed=seed)
-    # Saturated classifiers make denormal numbers, which are many times slower.
-    th.set_flush_denormal(True)
     if eval_freq:
         try:
             gym.spec(env_id)

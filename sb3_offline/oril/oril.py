@@ -95,7 +95,8 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         optimizer = th.optim.Adam(model.parameters(), lr=self.reward_learning_rate)
         for _ in range(self.reward_steps):
             data_logits = model(self.augment(self.replay_buffer.sample(self.batch_size, self._vec_normalize_env).observations))
-            example_logits = model(self.augment(self.sample_examples()))
+            examples, rows = self.sample_examples()
+            example_logits = model(self.augment(examples))[rows]
             loss = classifier_loss(example_logits, data_logits, self.positive_prior)
             self._optimize(optimizer, loss)
             self._record(
