@@ -75,7 +75,7 @@ td small { color: #57606a; display: inline-block; min-width: 44px; }
 pre { font-size: 12px; white-space: pre-wrap; overflow-wrap: anywhere; margin: 8px 0 0; }
 summary { cursor: pointer; color: #0969da; }
 @media (max-width: 640px) { body { padding: 16px 10px 32px; } section { padding: 12px; }
-  .strip { grid-template-columns: repeat(4, 1fr); } .curves svg text { font-size: 20px; } }
+  .strip { grid-template-columns: repeat(4, 1fr); } .curves svg text { font-size: 16px; } }
 """
 
 
