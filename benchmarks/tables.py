@@ -1,31 +1,62 @@
 """
-Write the tables of the README and the docs from the CSV files in results/.
+Write the tables of the README and the docs from the files in results/.
 
     python benchmarks/tables.py [--check]
 
-A table stands between `<!-- results/NAME.csv -->` and `<!-- end -->`; nothing between the two is typed by hand.
+A table stands between `<!-- results/NAME.csv -->` (or .json) and `<!-- end -->`; nothing between the two is typed by hand.
 """
 
 import csv
+import json
 import re
+import statistics
 import sys
 from pathlib import Path
+from typing import Any
 
 from sb3_offline.demo.pipeline import result_table
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCK = re.compile(r"(<!-- (results/\S+\.csv) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (results/\S+\.(?:csv|json)) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def table(path: Path) -> str:
-    """:return: the CSV file as a Markdown table"""
+    """:return: the file as a Markdown table"""
+    if path.suffix == ".json":
+        return card_table(json.loads(path.read_text()))
     with path.open() as file:
         rows = list(csv.DictReader(file))
+    if "library" in rows[0]:
+        return library_table(rows)
     if "change" in rows[0]:
         return checkpoint_table(rows)
     if "bound_holds" in rows[0]:
         return world_table(rows)
     return rate_table(rows) if "commit" in rows[0] else result_table(rows)
+
+
+def card_table(card: dict[str, Any]) -> str:
+    """A row a task of a dataset's card, and what holds for all of them."""
+    lines = [
+        "| task | episodes | successful | in the paper | checkpoints: decisions trained (success, weight) |",
+        "|---" * 5 + "|",
+    ]
+    for task, entry in card["tasks"].items():
+        mix = (f"{part['step']:,} ({part['success_rate']:.0%}, {part['weight']:.2f})" for part in entry["mix"])
+        shares = f"{entry['success_share']:.1%} | {entry['paper_share']:.0%}"
+        lines.append(f"| {task} | {entry['episodes']:,} | {shares} | {', '.join(mix)} |")
+    sizes = card["bytes_per_decision"]
+    facts = {
+        "Decisions": f"{card['decisions']:,}",
+        "Observations": card["obs_type"],
+        "Size": f"{card['bytes'] / 1e6:,.1f} MB",
+        "Bytes a decision": f"{sizes['contiguous']:,}, compressed {sizes['compressed']:,}",
+        "SHA-256 of actions and scene states": f"`{card['sha256_actions_and_scene_states']}`",
+        "Command": f"`{card['command']}`",
+        "Time taken": f"{card['seconds'] / 60:.1f} minutes",
+        "Versions": ", ".join(f"{name} {version}" for name, version in card["versions"].items()),
+    }
+    return "\n".join([*lines, "", "| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts.items())])
 
 
 def world_table(rows: list[dict[str, str]]) -> str:
@@ -58,6 +89,21 @@ def rate_table(rows: list[dict[str, str]]) -> str:
             cells.append(f"{means[-1]:.2f}{spread}{crashed}" if rates else "")
         mean = f"{sum(means) / len(means):.2f}" if len(means) == len(tasks) else ""
         lines.append(f"| {label} | " + " | ".join([*cells, mean]) + " |")
+    return "\n".join(lines)
+
+
+def library_table(rows: list[dict[str, str]]) -> str:
+    """A row an algorithm, a column a library: mean return and standard deviation over the seeds."""
+    libraries = list(dict.fromkeys(row["library"] for row in rows))
+    lines = ["| algorithm | gradient steps | seeds | " + " | ".join(libraries) + " |", "|---" * (3 + len(libraries)) + "|"]
+    for algorithm in dict.fromkeys(row["algorithm"] for row in rows):
+        own = [row for row in rows if row["algorithm"] == algorithm]
+        seeds = dict.fromkeys(row["seed"] for row in own)
+        cells = []
+        for library in libraries:
+            returns = [float(row["mean_return"]) for row in own if row["library"] == library]
+            cells.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
+        lines.append(f"| {algorithm} | {own[0]['gradient_steps']} | {', '.join(seeds)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
