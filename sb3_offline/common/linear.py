@@ -41,9 +41,11 @@ class _Linear(th.autograd.Function):
         weight = weight.to(x.dtype).contiguous()
         output = _product(weight, x).t()
         if bias is not None:
-            output.add_(bias.to(x.dtype))
+            output.view(-1, *bias.shape).add_(bias.to(x.dtype))
         if relu:
             output.relu_()
+        if bias is not None:
+            ctx.bias_shape, ctx.bias_dtype = bias.shape, bias.dtype
         ctx.save_for_backward(x, weight, output if relu else None)
         return output
 
@@ -52,12 +54,17 @@ class _Linear(th.autograd.Function):
         x, weight, output = ctx.saved_tensors
         needs_x, needs_weight, needs_bias, _ = ctx.needs_input_grad
         if ctx.relu:
-            gradient = th.ops.aten.threshold_backward(gradient, output, 0)
-        gradient = gradient.t().contiguous().t()
+            # Into the output, which no one reads any more: fresh memory would cost more than the operation.
+            gradient = th.ops.aten.threshold_backward.grad_input(gradient, output, 0, grad_input=output)
+        by_feature = gradient.t().contiguous()
+        bias_gradient = None
+        if needs_bias:
+            rows = ctx.bias_shape[0] if len(ctx.bias_shape) == 2 else 1
+            bias_gradient = by_feature.view(len(by_feature), -1, rows).sum(dim=1).t().reshape(ctx.bias_shape)
         return (
-            _product(weight.t(), gradient).t() if needs_x else None,
-            _product(gradient.t(), x.t()).to(ctx.parameter_dtype) if needs_weight else None,
-            gradient.sum(dim=0).to(ctx.parameter_dtype) if needs_bias else None,
+            _product(weight.t(), by_feature.t()).t() if needs_x else None,
+            _product(by_feature, x.t()).to(ctx.parameter_dtype) if needs_weight else None,
+            None if bias_gradient is None else bias_gradient.to(ctx.bias_dtype),
             None,
         )
 
@@ -80,7 +87,7 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, relu:
 
     :param x: ``(rows, in_features)``
     :param weight: ``(out_features, in_features)``
-    :param bias: ``(out_features,)``
+    :param bias: ``(out_features,)``; or ``(b, out_features)``, one for each of b rows, for the next b rows again, and so on
     :param relu: whether a ReLU follows
     :return: ``(rows, out_features)``
     """

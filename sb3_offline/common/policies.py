@@ -191,8 +191,9 @@ class OfflineCritic(ContinuousCritic):
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
             of_state = linear(features, state_weight, q_net[0].bias)
-            hidden = linear(samples.flatten(0, 1), action_weight).unflatten(0, samples.shape[:2]) + of_state
-            outputs.append(run_layers(list(q_net)[1:], hidden.flatten(0, 1)).view(samples.shape[:2]))
+            relu = type(q_net[1]) is nn.ReLU
+            hidden = linear(samples.flatten(0, 1), action_weight, of_state, relu)
+            outputs.append(run_layers(list(q_net)[1 + relu :], hidden).view(samples.shape[:2]))
         return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
