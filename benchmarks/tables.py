@@ -38,11 +38,11 @@ def table(path: Path) -> str:
 def card_table(card: dict[str, Any]) -> str:
     """A row a task of a dataset's card, and what holds for all of them."""
     lines = [
-        "| task | episodes | successful | in the paper | checkpoints: decisions trained (success, weight) |",
+        "| task | episodes | successful | in the paper | checkpoints: run, decisions trained (success, weight) |",
         "|---" * 5 + "|",
     ]
     for task, entry in card["tasks"].items():
-        mix = (f"{part['step']:,} ({part['success_rate']:.0%}, {part['weight']:.2f})" for part in entry["mix"])
+        mix = (f"{part['run']} {part['step']:,} ({part['success_rate']:.0%}, {part['weight']:.2f})" for part in entry["mix"])
         shares = f"{entry['success_share']:.1%} | {entry['paper_share']:.0%}"
         lines.append(f"| {task} | {entry['episodes']:,} | {shares} | {', '.join(mix)} |")
     sizes = card["bytes_per_decision"]

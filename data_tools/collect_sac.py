@@ -158,7 +158,13 @@ def _provenance(collection: Collection, shard: int, n_shards: int) -> dict[str, 
             )
         weights = mix_weights([checkpoint.success_rate for checkpoint in known[task]], PAPER_SHARES[task])
         mix[task] = [
-            {"step": checkpoint.step, "sha256": checkpoint.sha256, "success_rate": checkpoint.success_rate, "weight": weight}
+            {
+                "run": checkpoint.run,
+                "step": checkpoint.step,
+                "sha256": checkpoint.sha256,
+                "success_rate": round(checkpoint.success_rate, 4),
+                "weight": weight,
+            }
             for checkpoint, weight in zip(known[task], weights.round(6).tolist(), strict=True)
         ]
     options = {name: value for name, value in asdict(collection).items() if name not in ("obs_type", "policies", "tasks")}
@@ -228,7 +234,7 @@ def run(args: argparse.Namespace) -> None:
         paths = [collect_shard(args.output, collection, *(args.shard or (0, 1)), n_workers=args.workers)]
     seconds = time.time() - started
     for task, share in success_shares(paths).items():
-        print(f"{task:<12} {share:6.1%} of the episodes solved")
+        print(f"{task:<12} {share:6.1%} of the episodes solved (in the paper {PAPER_SHARES[task]:.0%})")
     print(f"sha256 of actions and scene states: {content_hash(paths)}")
     if args.examples:
         write_examples(args.examples, paths, collection, args)

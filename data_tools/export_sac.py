@@ -26,35 +26,49 @@ MEASURE_SEED = 2_000_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: gets the options of ``run``"""
-    parser.add_argument(
-        "runs", nargs="+", type=Path, help="folders of train-sac; a later one's task replaces an earlier one's"
-    )
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of train-sac")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for policies.json and the weights")
-    parser.add_argument("--checkpoints", type=int, default=6, help="per task (default: 6)")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="those of other tasks there stay")
+    parser.add_argument("--checkpoints", type=int, default=6, help="of each run and task (default: 6)")
     parser.add_argument("--episodes", type=int, default=300, help="to measure each one with (default: 300)")
     parser.add_argument("--workers", type=int, default=2)
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    folders = {task: folder for run in args.runs for task in TASKS if (folder := run / task / "curve.csv").exists()}
-    if not folders:
+    jobs = [
+        (task, path)
+        for task in args.tasks
+        for run in args.runs
+        if (run / task / "curve.csv").exists()
+        for path in choose_checkpoints(run / task, args.checkpoints)
+    ]
+    if not jobs:
         raise DatasetError(args.runs[0], "curve.csv", "is in no task's folder", "Run sb3-offline train-sac first")
-    jobs = [(task, path) for task, curve in folders.items() for path in choose_checkpoints(curve.parent, args.checkpoints)]
     measured = map_in_order(functools.partial(_measure, n_episodes=args.episodes), jobs, args.workers)
     args.output.mkdir(parents=True, exist_ok=True)
-    tasks: dict[str, Any] = {task: _provenance(curve.parent) for task, curve in folders.items()}
+    index = args.output / "policies.json"
+    tasks: dict[str, Any] = json.loads(index.read_text())["tasks"] if index.exists() else {}
+    for task in {task for task, _ in jobs}:
+        tasks[task] = {
+            "algorithm": "stable_baselines3.SAC, MlpPolicy, state observations",
+            "runs": {run.name: _provenance(run / task) for run in args.runs if (run / task / "curve.csv").exists()},
+            "checkpoints": [],
+        }
     for (task, path), successes in zip(jobs, measured, strict=True):
-        name = f"{task}_{path.name}"
-        shutil.copyfile(path, args.output / name)
-        checkpoint = {"file": name, "sha256": file_sha256(path), "step": int(path.stem)}
-        tasks[task]["checkpoints"].append({**checkpoint, "successes": successes, "episodes": args.episodes})
-        print(f"{task:<12} after {int(path.stem):>7} decisions: {successes} of {args.episodes} solved", flush=True)
+        run_name = path.parent.parent.parent.name
+        checkpoint = {"file": f"{task}_{run_name}_{path.name}", "run": run_name, "step": int(path.stem)}
+        shutil.copyfile(path, args.output / checkpoint["file"])
+        measurement = {"sha256": file_sha256(path), "successes": successes, "episodes": args.episodes}
+        tasks[task]["checkpoints"].append({**checkpoint, **measurement})
+        print(
+            f"{task:<12} after {int(path.stem):>7} decisions of {run_name}: {successes} of {args.episodes} solved", flush=True
+        )
     kept = {checkpoint["file"] for entry in tasks.values() for checkpoint in entry["checkpoints"]}
     for old in args.output.glob("*.npz"):
         if old.name not in kept:
             old.unlink()
-    (args.output / "policies.json").write_text(json.dumps({"env_id": ENV_ID, "tasks": tasks}, indent=2) + "\n")
+    index.write_text(json.dumps({"env_id": ENV_ID, "tasks": dict(sorted(tasks.items()))}, indent=2) + "\n")
 
 
 def choose_checkpoints(folder: Path, n: int) -> list[Path]:
@@ -83,11 +97,9 @@ def _provenance(folder: Path) -> dict[str, Any]:
     curve = read_curve(folder)
     learners = {name: importlib.metadata.version(name) for name in ("stable_baselines3", "torch")}
     return {
-        "algorithm": "stable_baselines3.SAC, MlpPolicy, state observations",
         "settings": SETTINGS[curve[-1]["settings"]],
         "seed": int(curve[-1]["seed"]),
         "trained_decisions": int(curve[-1]["step"]),
         "commit": curve[-1]["commit"],
         "versions": {**versions(), **learners},
-        "checkpoints": [],
     }

@@ -88,6 +88,7 @@ class Checkpoint:
 
     :param file: path of its weights
     :param sha256: of the file
+    :param run: name of the training run
     :param step: decisions trained
     :param successes: solved episodes
     :param episodes: of so many
@@ -95,6 +96,7 @@ class Checkpoint:
 
     file: Path
     sha256: str
+    run: str
     step: int
     successes: int
     episodes: int
@@ -108,7 +110,7 @@ class Checkpoint:
 def load_policies(folder: str | os.PathLike[str]) -> dict[str, list[Checkpoint]]:
     """
     :param folder: with ``policies.json`` and the files it names, as ``sb3-offline export-sac`` writes it
-    :return: checkpoints by task, in the order of training; raises ``DatasetError`` for a file that was not measured
+    :return: checkpoints by task; raises ``DatasetError`` for a file that was not measured
     """
     path = Path(folder) / "policies.json"
     remedy = "Name a folder written by sb3-offline export-sac"
@@ -140,13 +142,9 @@ def mix_weights(success_rates: Sequence[float], share: float) -> np.ndarray:
 
     :param success_rates: (n,) of the checkpoints, measured
     :param share: of successful episodes in the data
-    :return: (n,) float64, how often to take each; raises ``ValueError`` where the checkpoints cannot be mixed to that share
+    :return: (n,) float64, how often to take each; where no mix has that share, the checkpoints that come nearest to it
     """
     rates = np.asarray(success_rates, dtype=np.float64)
-    if not rates.min() < share < rates.max():
-        raise ValueError(
-            f"Checkpoints with success rates of {rates.min():.2f} to {rates.max():.2f} cannot be mixed to {share:.2f}."
-        )
 
     def weights(k: float) -> np.ndarray:
         unnormalised = np.exp(k * (rates - rates.max() if k > 0 else rates - rates.min()))

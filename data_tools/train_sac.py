@@ -44,14 +44,16 @@ _BASE: dict[str, Any] = {
     "learning_starts": 2_000,
     "buffer_size": 250_000,
 }
-_EXPLORE: dict[str, Any] = {**_BASE, "scaled_states": True, "target_entropy": -1.0, "ou_noise": 0.2}
+_EXPLORE: dict[str, Any] = {**_BASE, "scaled_states": True, "target_entropy": -1.0, "ou_noise": (0.2, 0.01)}
+_BOLD: dict[str, Any] = {**_EXPLORE, "target_entropy": 0.0, "ou_noise": (0.2, 1.0)}
 SETTINGS: dict[str, dict[str, Any]] = {
     "base": {**_BASE, "policy_kwargs": {"net_arch": [128, 128]}},
     "explore": {**_EXPLORE, "policy_kwargs": {"net_arch": [128, 128]}},
+    "bold": {**_BOLD, "policy_kwargs": {"net_arch": [128, 128]}},
 }
 """
 Arguments of SAC by name, and two of this program: `scaled_states`, whether the networks see the state shifted and scaled (the
-actors that are kept take it as it is); `ou_noise`, the scale of Ornstein-Uhlenbeck noise on the actions while training.
+actors that are kept take it as it is); `ou_noise`, sigma and dt of Ornstein-Uhlenbeck noise on the actions while training.
 """
 
 
@@ -143,9 +145,9 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
         model.set_random_seed(slice_seed)
     else:
         arguments["policy_kwargs"]["optimizer_kwargs"] = {"fused": True}
-        sigma = arguments.pop("ou_noise", 0.0)
+        sigma, dt = arguments.pop("ou_noise", (0.0, 1.0))
         if sigma:
-            arguments["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(4), np.full(4, sigma))
+            arguments["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(4), np.full(4, sigma), dt=dt)
         model = SAC("MlpPolicy", env, seed=slice_seed, device="cpu", **arguments)
     model.learn(n_decisions, reset_num_timesteps=False)
     step += n_decisions

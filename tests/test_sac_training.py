@@ -56,7 +56,8 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, c
     policies = load_policies(tmp_path / "policies")
     assert [(c.step, c.episodes) for c in policies["drawer-open"]] == [(100, 2), (150, 2)]
     entry = json.loads((tmp_path / "policies/policies.json").read_text())["tasks"]["drawer-open"]
-    assert entry["trained_decisions"] == 150 and {"settings", "seed", "commit", "versions"} <= entry.keys()
+    assert entry["runs"]["stopped"]["trained_decisions"] == 150
+    assert {"settings", "seed", "commit", "versions"} <= entry["runs"]["stopped"].keys()
     policies["drawer-open"][0].file.write_bytes(b"others")
     with pytest.raises(DatasetError, match="sha256"):
         load_policies(tmp_path / "policies")
