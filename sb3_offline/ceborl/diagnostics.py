@@ -1,0 +1,147 @@
+"""Says while a classifier is trained what goes wrong with it, and what to try."""
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_offline.ceborl.ceborl import CEBORL
+
+SATURATED_CLASSIFIER, SATURATED_SHARE = 0.99, 0.5
+ON_BOUNDS, COLLAPSED_SHARE = 0.98, 0.5
+CLIPPED_SHARE = 0.01
+EFFECTIVE_TRANSITIONS = 4
+
+_REMEDIES = {
+    "classifier_saturated": (
+        "C is above {saturated} on {classifier_saturated:.0%} of the data: the classifier takes most of it for success, and "
+        "the gradient of the penalty, C (1 - C), is gone. Try, in this order: backup='dataset' and initial_odds=0.01 (the "
+        "defaults); class_prior=0.1; example_share=0.02; policy_kwargs={{'critic_layer_norm': True}}; data with more failures"
+    ),
+    "omega_clipped": (
+        "The target's odds are at omega_max={omega_max:g} for {omega_clipped:.0%} of the data: the values run away, or the "
+        "bound is so low that it flattens their order. If the classifier is saturated, see there. Otherwise raise omega_max "
+        "(1e4 is the default; odds of 20 to 60 are normal)"
+    ),
+    "actions_on_bounds": (
+        "The policy sits on the bounds of the action space, with {actions_on_bounds:.0%} of its actions' entries against "
+        "{data_actions_on_bounds:.0%} of the data's: it exploits the classifier where there are no data. Try "
+        "policy_extraction='weighted' and backup='dataset' (the defaults); otherwise a higher ent_coef, mu='mixture', or "
+        "policy_kwargs={{'std_min': 0.05}}"
+    ),
+    "domain_gap": (
+        "After {steps} steps the classifier tells all examples from each of {n_transitions} states of the data. Either the "
+        "data hold no success, or it looks at something else: another camera, light, crop or preprocessing; other objects; "
+        "entries of a vector that differ from episode to episode. Look at both side by side, and take the examples in the "
+        "set-up of the data. Keep random_shift=4 for images. For vectors raise the floor under the standard deviations: "
+        "policy_kwargs={{'features_extractor_kwargs': {{'std_min': 0.1}}}}"
+    ),
+    "weights_collapsed": (
+        "The policy imitates as much as {effective_transitions:.1f} transitions of a batch of {batch_size}: its weights are "
+        "too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower weight_max"
+    ),
+}
+
+
+class DiagnosticsCallback(BaseCallback):
+    """
+    Watches CEBORL or RCE while they learn, and warns once of each of these, with the remedy to try:
+
+    - the classifier saturates: it says success on most of the data
+    - omega hits its bound
+    - the actor collapses onto the bounds of the action space
+    - examples are told apart from the data at once, which is a domain gap, and not success
+    - the weighted regression comes down to a few transitions
+
+    It looks at transitions drawn with a generator of its own, so a run with it is the same as one without. What it measures
+    is logged under ``diagnostics/``.
+
+    :param check_freq: gradient steps between two looks
+    :param n_transitions: transitions to look at, and all examples
+    :param early_steps: up to this step, examples and data that are perfectly told apart count as a domain gap. Later, a
+        classifier may know all of its examples by heart
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    """
+
+    model: CEBORL
+
+    def __init__(self, check_freq: int = 500, n_transitions: int = 1024, early_steps: int = 2000, verbose: int = 0):
+        super().__init__(verbose)
+        self.check_freq, self.n_transitions, self.early_steps = check_freq, n_transitions, early_steps
+        self.warned: set[str] = set()
+        self._rng = np.random.default_rng(0)
+        self._weights_seen: tuple[th.Tensor, int] = (th.zeros(()), 0)
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, CEBORL):
+            raise TypeError(f"DiagnosticsCallback is for CEBORL and RCE, not for {type(self.model).__name__}")
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.check_freq == 0:
+            found = self.measure()
+            for name, value in found.items():
+                self.logger.record(f"diagnostics/{name}", value)
+            self._judge(found)
+        return True
+
+    @th.no_grad()
+    def measure(self) -> dict[str, float]:
+        """
+        :return: what is logged: shares between 0 and 1
+        """
+        model, buffer = self.model, self.model.replay_buffer
+        batch = buffer.transitions(self._rng.integers(buffer.size(), size=self.n_transitions), model._vec_normalize_env)
+        model.policy.set_training_mode(False)  # train() sets it again
+        features = model.critic.encode(batch.observations)
+        logits = model.critic.values(features, batch.actions).mean(dim=0)
+        target_logits = model.critic_target.values(model.critic_target.encode(batch.observations), batch.actions)
+        actions, values = self._policy_values(batch.observations, features)
+        examples = model.all_examples()
+        _, example_values = self._policy_values(examples, model.critic.encode(examples))
+        found = {
+            "classifier_saturated": logits.sigmoid() > SATURATED_CLASSIFIER,
+            "omega_clipped": target_logits.amin(dim=0) >= math.log(model.omega_max),
+            "actions_on_bounds": actions.abs() > ON_BOUNDS,
+            "data_actions_on_bounds": batch.actions.abs() > ON_BOUNDS,
+            "data_like_examples": values >= example_values.quantile(0.01),
+        }
+        return {name: float(hits.float().mean()) for name, hits in found.items()}
+
+    def _policy_values(self, observations: Any, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The policy's modes, and the classifier's logits of these: for examples, the data's actions are not known."""
+        mean, _ = self.model.actor.gaussian_parameters(self.model._policy_features(observations, features))
+        actions = th.tanh(mean)
+        return actions, self.model.critic.values(features, actions).mean(dim=0)
+
+    def _effective_weights(self) -> float:
+        """:return: effective share of a batch in the weighted regression, a mean since the last look or log dump"""
+        total, count = self.model._metrics.get("effective_weights", (th.zeros(()), 0))
+        last_total, last_count = self._weights_seen if self._weights_seen[1] <= count else (th.zeros(()), 0)
+        self._weights_seen = total, count
+        return float(total - last_total) / (count - last_count) if count > last_count else 1.0
+
+    def _judge(self, found: dict[str, float]) -> None:
+        more = found["actions_on_bounds"] - found["data_actions_on_bounds"]
+        effective_transitions = self._effective_weights() * self.model.batch_size
+        wrong = {
+            "classifier_saturated": found["classifier_saturated"] > SATURATED_SHARE,
+            "omega_clipped": found["omega_clipped"] > CLIPPED_SHARE,
+            "actions_on_bounds": found["actions_on_bounds"] > COLLAPSED_SHARE and more > COLLAPSED_SHARE / 2,
+            "domain_gap": found["data_like_examples"] == 0 and self.num_timesteps <= self.early_steps,
+            "weights_collapsed": effective_transitions < EFFECTIVE_TRANSITIONS,
+        }
+        about = {
+            **found,
+            **{name: getattr(self.model, name) for name in ("omega_max", "temperature", "advantage_floor", "batch_size")},
+            "saturated": SATURATED_CLASSIFIER,
+            "effective_transitions": effective_transitions,
+            "steps": self.num_timesteps,
+            "n_transitions": self.n_transitions,
+        }
+        for name, is_wrong in wrong.items():
+            if is_wrong and name not in self.warned:
+                self.warned.add(name)
+                warnings.warn(f"Step {self.num_timesteps}: {_REMEDIES[name].format(**about)}.", stacklevel=2)

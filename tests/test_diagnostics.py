@@ -1,0 +1,86 @@
+"""Each warning, in a run that deserves it; and none in one that does not."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch as th
+from point_mass import goal_examples, write_point_mass
+
+from sb3_offline import BC, CEBORL
+from sb3_offline.ceborl import PAPER_FORM, DiagnosticsCallback
+
+#: A target that follows the critic closely, large steps, no penalty: values run away within seconds
+RUNS_AWAY = {**PAPER_FORM, "tau": 0.05, "beta": 0.0, "learning_rate": 3e-3}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    path = tmp_path_factory.mktemp("point") / "point_mass.h5"
+    write_point_mass(path)
+    return str(path)
+
+
+def learn(dataset, steps, callback=None, examples=None, **kwargs):
+    """:return: the model, and what it was warned of"""
+    small = {"policy_kwargs": {"net_arch": [64, 64]}, "n_action_samples": 4, "batch_size": 128, "seed": 0, **kwargs}
+    model = CEBORL("MlpPolicy", None, dataset, goal_examples() if examples is None else examples, **small)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(steps, callback)
+    return model, [str(warning.message) for warning in caught]
+
+
+def test_a_run_that_learns_is_not_warned_of_and_stays_the_same(dataset):
+    watched, messages = learn(dataset, 150, DiagnosticsCallback(check_freq=50))
+    assert messages == []
+    alone, _ = learn(dataset, 150)
+    for name, value in watched.policy.state_dict().items():
+        assert th.equal(value, alone.policy.state_dict()[name]), name
+
+
+def test_values_that_run_away_are_told_once_each_with_a_remedy(dataset):
+    _, messages = learn(dataset, 550, DiagnosticsCallback(check_freq=50), **RUNS_AWAY)
+    for symptom, remedy in {
+        "of the data: the classifier takes most of it for success": "class_prior=0.1",
+        "at omega_max=10000 for": "see there",
+        "sits on the bounds": "policy_extraction='weighted'",
+    }.items():
+        assert [remedy in message for message in messages if symptom in message] == [True], symptom
+    assert len(messages) == 3 and all(message.startswith("Step ") for message in messages)
+
+
+def test_a_domain_gap_is_told(dataset):
+    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50), goal_examples() + np.float32(1.0))
+    assert len(messages) == 1 and "tells all examples from each of 1024 states" in messages[0]
+    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50, early_steps=40), goal_examples() + np.float32(1.0))
+    assert messages == []  # late, it may know them by heart
+
+
+def test_a_bound_of_omega_that_is_too_low_is_told(dataset):
+    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50), omega_max=0.005)
+    assert len(messages) == 1 and "at omega_max=0.005 for 100% of the data" in messages[0]
+
+
+def test_weights_that_are_too_sharp_are_told(dataset):
+    sharp = {"temperature": 0.02, "weight_max": 1e17, "learning_rate": 3e-3}
+    _, messages = learn(dataset, 100, DiagnosticsCallback(check_freq=20), **sharp)
+    assert len(messages) == 1 and "of a batch of 128" in messages[0] and "Raise temperature (now 0.02)" in messages[0]
+
+
+def test_what_is_measured_is_logged(dataset):
+    names = []
+
+    class Reads(DiagnosticsCallback):
+        def _on_step(self):
+            super()._on_step()
+            names.extend(self.logger.name_to_value)
+            return True
+
+    learn(dataset, 4, Reads(check_freq=2))
+    assert {"diagnostics/classifier_saturated", "diagnostics/data_like_examples"} <= set(names)
+
+
+def test_other_algorithms_are_refused(dataset):
+    with pytest.raises(TypeError, match="for CEBORL and RCE, not for BC"):
+        BC("MlpPolicy", None, dataset).learn(1, DiagnosticsCallback())
