@@ -30,6 +30,10 @@ def table(path: Path) -> str:
         return library_table(rows)
     if "change" in rows[0]:
         return checkpoint_table(rows)
+    if "env_step" in rows[0]:
+        return online_table(rows)
+    if "std_return" in rows[0]:
+        return expert_table(rows)
     if "bound_holds" in rows[0]:
         return world_table(rows)
     return rate_table(rows) if "commit" in rows[0] else result_table(rows)
@@ -104,6 +108,29 @@ def library_table(rows: list[dict[str, str]]) -> str:
             returns = [float(row["mean_return"]) for row in own if row["library"] == library]
             cells.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
         lines.append(f"| {algorithm} | {own[0]['gradient_steps']} | {', '.join(seeds)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def online_table(rows: list[dict[str, str]]) -> str:
+    """A row a method, a column a number of environment steps: mean return and range over the seeds."""
+    steps = sorted({int(row["env_step"]) for row in rows})[::2]
+    lines = ["| method | seeds | " + " | ".join(f"step {step}" for step in steps) + " |", "|---" * (2 + len(steps)) + "|"]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = [row for row in rows if row["method"] == method]
+        cells = []
+        for step in steps:
+            returns = [float(row["mean_return"]) for row in own if int(row["env_step"]) == step]
+            cells.append(f"{statistics.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})")
+        lines.append(f"| {method} | {', '.join(dict.fromkeys(row['seed'] for row in own))} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def expert_table(rows: list[dict[str, str]]) -> str:
+    """A row a policy: its return and the standard deviation between its episodes."""
+    lines = ["| policy | seed | gradient steps | episodes | return |", "|---" * 5 + "|"]
+    for row in rows:
+        names = [row["policy"], row["seed"], row["gradient_steps"], row["episodes"]]
+        lines.append(f"| {' | '.join(names)} | {float(row['mean_return']):.0f} ± {float(row['std_return']):.0f} |")
     return "\n".join(lines)
 
 

@@ -1,0 +1,27 @@
+"""Source distributions of other projects, whose data and tests are not in their wheels."""
+
+import os
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+
+def fetch(package: str, version: str, folder: Path) -> Path:
+    """
+    :param package: name on PyPI
+    :param version: exact
+    :param folder: to download and unpack into, where it is not there yet
+    :return: the unpacked source distribution
+    """
+    root = folder / f"{package}-{version}"
+    if not root.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "pip", "download", f"{package}=={version}", "--no-deps", "--no-binary", package]
+        # pip asks even a package that it only downloads for its version, and some take that from git
+        names = (f"{tool}_PRETEND_VERSION_FOR_{package.upper()}" for tool in ("SETUPTOOLS_SCM", "VCS_VERSIONING"))
+        environment = {**os.environ, **dict.fromkeys(names, version)}
+        subprocess.run([*command, "--quiet", "--dest", str(folder)], check=True, env=environment)
+        with tarfile.open(next(folder.glob(f"{package}-{version}.tar.*"))) as archive:
+            archive.extractall(folder, filter="data")
+    return root
