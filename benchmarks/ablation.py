@@ -44,6 +44,8 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "3-step omega": {"n_steps": 3},
         "30-step omega": {"n_steps": 30},
         "omega with the policy's action": {"backup": "policy"},
+        "omega of states: expectile 0.7": {"backup": "expectile", "expectile": 0.7},
+        "omega of states: expectile 0.9": {"backup": "expectile", "expectile": 0.9},
         "tau = 0.005": {"tau": 0.005},
     },
     "networks": {

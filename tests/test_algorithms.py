@@ -261,10 +261,25 @@ def test_rce_target_is_that_of_its_paper(n_steps, files):
     assert isinstance(model, RCE) and model.beta == 0
 
 
+def test_expectile_backup_takes_the_odds_of_states(files):
+    """The state head goes to an upper expectile of the target's logits, and omega is its odds at the next state."""
+    model = make("ceborl", "MlpPolicy", files, backup="expectile", expectile=0.99, n_steps=1, learning_rate=3e-3)
+    batch = model.replay_buffer.sample(8)
+    expected = model.critic_target.state_values(model.critic_target.encode(batch.next_observations)).exp()
+    th.testing.assert_close(model._discounted_omega(batch), 0.99 * expected)
+    model._update_target = lambda: None
+    model.learn(300)
+    batch = model.replay_buffer.transitions(np.arange(model.replay_buffer.size()))
+    targets = model.critic_target.values(model.critic_target.encode(batch.observations), batch.actions).amin(dim=0)
+    above = (model.critic.state_values(model.critic.encode(batch.observations)) > targets).float().mean()
+    assert above > 0.8
+
+
 @pytest.mark.parametrize(
     "kwargs",
     [
         {"mu": "mixture"},
+        {"backup": "expectile"},
         {"mu": "policy", "penalty_space": "logit"},
         {"backup": "policy", "policy_extraction": "maximize", "n_steps": 1},
         {"n_steps": 1, "beta": 0.0, "example_share": 0.0},

@@ -11,12 +11,12 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_offline import CQL, DCQL, IQL, ORIL
-from sb3_offline.common.losses import bellman_loss
+from sb3_offline.common.losses import bellman_loss, expectile_loss
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.cql.losses import conservative_gaps
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
-from sb3_offline.iql.losses import advantage_weights, expectile_loss
+from sb3_offline.iql.losses import advantage_weights
 from sb3_offline.oril.losses import classifier_loss
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)

@@ -15,6 +15,7 @@ from sb3_offline.ceborl.losses import (
     success_odds,
 )
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.losses import expectile_loss
 from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.reader import DatasetSource
 
@@ -32,7 +33,7 @@ PAPER_FORM: dict[str, Any] = {
 _CHOICES = {
     "mu": ("uniform", "policy", "mixture"),
     "penalty_space": ("probability", "logit"),
-    "backup": ("dataset", "policy"),
+    "backup": ("dataset", "policy", "expectile"),
     "policy_extraction": ("weighted", "maximize"),
 }
 
@@ -77,7 +78,9 @@ class CEBORL(ExampleBasedAlgorithm):
         "relative" density ratio).
     :param initial_odds: odds of the untrained classifier. A network's usual first output, 0, means odds of 1, far above the
         truth; discounting takes thousands of steps to bring them down, and until then they look like success.
-    :param backup: next action a' of omega: the ``"dataset"``'s, or the ``"policy"``'s as in the paper
+    :param backup: next action a' of omega: the ``"dataset"``'s, or the ``"policy"``'s as in the paper; or ``"expectile"``: no
+        action, but a state's odds as an upper expectile of the logits of the data's actions in it, as in IQL
+    :param expectile: of ``backup="expectile"``: 0.5 is the mean, near 1 the best of the data's actions
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
         paper's Eq. 11
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
@@ -117,6 +120,7 @@ class CEBORL(ExampleBasedAlgorithm):
         example_share: float = 0.02,
         initial_odds: float = 0.01,
         backup: str = "dataset",
+        expectile: float = 0.9,
         policy_extraction: str = "weighted",
         temperature: float = 0.3,
         advantage_floor: float = 0.01,
@@ -163,6 +167,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.example_share = example_share
         self.initial_odds = initial_odds
         self.backup = backup
+        self.expectile = expectile
         self.policy_extraction = policy_extraction
         self.temperature = temperature
         self.advantage_floor = advantage_floor
@@ -176,10 +181,11 @@ class CEBORL(ExampleBasedAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        self.needs_next_actions = self.backup == "dataset"
+        self.needs_next_actions = self.backup != "policy"
         self.policy_kwargs.setdefault("critic_output_bias", math.log(self.initial_odds))
-        if self.policy_extraction == "weighted":
+        if self.policy_extraction == "weighted" or self.backup == "expectile":
             self.policy_kwargs.setdefault("critic_state_value", True)
+        if self.policy_extraction == "weighted":
             self.policy_kwargs.setdefault("std_min", 0.05)
         super()._setup_model()
 
@@ -214,7 +220,12 @@ class CEBORL(ExampleBasedAlgorithm):
                 term_a = conservative_penalty(data_logits, sampled_logits, self.penalty_space)
                 critic_loss = critic_loss + self.beta * term_a
                 self._record(penalty=term_a, classifier_penalized=sampled_logits.sigmoid().mean())
-            if self.policy_extraction == "weighted":
+            if self.backup == "expectile":
+                state_logits = self.critic.state_values(features).unsqueeze(0)
+                with th.no_grad():
+                    target_logits = self.critic_target.values(self.critic_target.encode(observations), batch.actions)
+                critic_loss = critic_loss + expectile_loss(target_logits.amin(dim=0) - state_logits.squeeze(0), self.expectile)
+            elif self.policy_extraction == "weighted":
                 # The same classification without the action: its odds are the mean over the data's actions.
                 state_logits, example_state_logits = self.critic.state_values(both_features).unsqueeze(0).split(parts, dim=1)
                 critic_loss = critic_loss + recursive_loss(state_logits, discounted_omega)
@@ -284,10 +295,12 @@ class CEBORL(ExampleBasedAlgorithm):
         observations = self.augment(observations)
         if self.backup == "policy":
             actions, _ = self.actor.sample(self.actor.encode(observations))
-        else:
+            logits = self.critic_target.values(self.critic_target.encode(observations), actions)
+        elif self.backup == "dataset":
             assert dataset_actions is not None
-            actions = dataset_actions
-        logits = self.critic_target.values(self.critic_target.encode(observations), actions)
+            logits = self.critic_target.values(self.critic_target.encode(observations), dataset_actions)
+        else:
+            logits = self.critic_target.state_values(self.critic_target.encode(observations)).unsqueeze(0)
         self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
         return logits
 

@@ -12,3 +12,14 @@ def bellman_loss(values: th.Tensor, targets: th.Tensor) -> th.Tensor:
     :return: scalar, summed over the critics
     """
     return (values - targets).pow(2).mean(dim=1).sum()
+
+
+def expectile_loss(errors: th.Tensor, expectile: float) -> th.Tensor:
+    """
+    ``E_D[|expectile - 1(u < 0)| u^2]``: minimal where the prediction is the expectile of the targets.
+
+    :param errors: u, targets minus predictions, ``(batch,)``
+    :param expectile: between 0 and 1; 0.5 gives the mean, 1 the maximum
+    :return: scalar
+    """
+    return (th.abs(expectile - (errors < 0).to(errors.dtype)) * errors.pow(2)).mean()

@@ -6,10 +6,10 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_offline.common.losses import bellman_loss
+from sb3_offline.common.losses import bellman_loss, expectile_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.data.reader import DatasetSource
-from sb3_offline.iql.losses import advantage_weights, expectile_loss
+from sb3_offline.iql.losses import advantage_weights
 
 
 class IQL(RewardBasedAlgorithm):
