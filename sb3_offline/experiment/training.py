@@ -12,6 +12,7 @@ import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_offline
+from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.selection import select_episodes
@@ -185,6 +186,8 @@ def train(
     (output / "model.zip").unlink(missing_ok=True)  # of an earlier run: this one is finished when its own is there
     (output / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
     callbacks = [callback] if callback is not None else []
+    if isinstance(model, CEBORL):
+        callbacks.append(DiagnosticsCallback())
     if eval_freq:
         table = output / "evaluations.csv"
         callbacks.append(
