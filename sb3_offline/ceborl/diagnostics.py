@@ -114,7 +114,7 @@ class DiagnosticsCallback(BaseCallback):
         """The policy's modes, and the classifier's logits of these: for examples, the data's actions are not known."""
         mean, _ = self.model.actor.gaussian_parameters(self.model._policy_features(observations, features))
         actions = th.tanh(mean)
-        return actions, self.model.critic.values(features, actions).mean(dim=0)
+        return actions, self.model.critic.values(features, actions).mean(dim=0).float()
 
     def _effective_weights(self) -> float:
         """:return: effective share of a batch in the weighted regression, a mean since the last look or log dump"""
