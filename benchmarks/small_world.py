@@ -94,6 +94,7 @@ class Variant:
 
     name: str
     backup: str = "policy"
+    expectile: float = 0.9
     policy_extraction: str = "maximize"
     n_steps: int = 1
     beta: float = 0.1
@@ -144,10 +145,11 @@ def solve(world: World, variant: Variant, n_iterations: int = 1500, policy_rate:
     successors = _Successors(world, variant)
     logits = th.full((N_STATES, N_ACTIONS), float(np.log(variant.initial_odds)), dtype=th.float64)
     policy = th.tensor(world.behavior if variant.fixed_policy is None else variant.fixed_policy)
+    state_logits = logits.mean(dim=1)  # of states alone
     residual = np.inf
     for _ in range(n_iterations):
         odds = losses.success_odds(logits.unsqueeze(0), variant.omega_max)
-        omega = successors.discounted_omega(odds, policy)
+        omega = successors.discounted_omega(odds, state_logits.exp(), policy)
         shown = examples[:, None] * policy  # p(s, a) of an example with the policy's action
         gradient = eq_10_gradient(variant, logits, d, shown, omega, policy)
 
@@ -160,10 +162,14 @@ def solve(world: World, variant: Variant, n_iterations: int = 1500, policy_rate:
         step = th.where(gradient == 0, 0.0, gradient / curvature.clamp_min(1e-30)).clamp(-0.5, 0.5)
         logits = (logits - step).clamp_min(LOGIT_MIN)
         residual = float((step.abs() * (logits > LOGIT_MIN)).max())
+        if variant.backup == "expectile":
+            # The mean in which those above count expectile / (1 - expectile) times: where the gradient of its loss is zero
+            share = d * th.where(logits > state_logits[:, None], variant.expectile, 1 - variant.expectile)
+            state_logits = (share * logits).sum(dim=1) / share.sum(dim=1)
+        else:  # the minimum of the same loss as that of pairs: positives over negatives
+            state_logits = (positives.sum(dim=1) / (d_state + variant.example_share * examples)).log()
         if variant.fixed_policy is None:
-            # The classifier of states alone, at its minimum: positives over negatives
-            state_odds = positives.sum(dim=1) / (d_state + variant.example_share * examples)
-            wanted = _improved_policy(variant, logits, state_odds.log(), policy, th.tensor(world.behavior))
+            wanted = _improved_policy(variant, logits, state_logits, policy, th.tensor(world.behavior))
             policy = policy + policy_rate * (wanted - policy)
     scale = world.class_share / variant.class_prior
     return Solution(scale * logits.exp().numpy(), policy.numpy(), world.future_success(policy.numpy()), residual)
@@ -228,11 +234,13 @@ class _Successors:
             pairs = np.einsum("msa,msax,mxb->saxb", posterior, ahead, world.modes)
             self.horizons.append((GAMMA**n, th.tensor(states), th.tensor(pairs)))
 
-    def discounted_omega(self, odds: th.Tensor, policy: th.Tensor) -> th.Tensor:
+    def discounted_omega(self, odds: th.Tensor, state_odds: th.Tensor, policy: th.Tensor) -> th.Tensor:
         """:return: (S, A), the mean over the horizons"""
         parts = []
         for discount, states, pairs in self.horizons:
-            if self.variant.backup == "policy":
+            if self.variant.backup == "expectile":
+                parts.append(discount * th.einsum("sax,x->sa", states, state_odds))
+            elif self.variant.backup == "policy":
                 parts.append(discount * th.einsum("sax,xb,xb->sa", states, policy, odds))
             else:
                 parts.append(discount * th.einsum("saxb,xb->sa", pairs, odds))
@@ -296,6 +304,8 @@ def all_variants(world: World) -> dict[str, list[Variant]]:
             change(shipped, example_share=0.0),
             change(shipped, class_prior=round(world.class_share, 3)),
             change(shipped, backup="policy"),
+            change(shipped, backup="expectile"),
+            change(shipped, backup="expectile", n_steps=1),
             change(shipped, policy_extraction="maximize"),
         ],
         "fixed policy": [change(known, beta=beta) for beta in (0.0, 0.01, 0.1, 1.0, 10.0)],
