@@ -23,7 +23,8 @@ BLOCK = re.compile(r"(<!-- (results/\S+\.(?:csv|json)) -->\n).*?(<!-- end -->)",
 def table(path: Path) -> str:
     """:return: the file as a Markdown table"""
     if path.suffix == ".json":
-        return card_table(json.loads(path.read_text()))
+        content = json.loads(path.read_text())
+        return throughput_table(content) if isinstance(content, list) else card_table(content)
     with path.open() as file:
         rows = list(csv.DictReader(file))
     if "library" in rows[0]:
@@ -61,6 +62,28 @@ def card_table(card: dict[str, Any]) -> str:
         "Versions": ", ".join(f"{name} {version}" for name, version in card["versions"].items()),
     }
     return "\n".join([*lines, "", "| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts.items())])
+
+
+def throughput_table(entries: list[dict[str, Any]]) -> str:
+    """Three tables: beside peers, against the floor, and all other costs."""
+    lines = ["| | ours, ms | peer | peer, ms | times as fast |", "|---" * 5 + "|"]
+    floors = ["| | ms | floor, ms | GFLOP a step | GFLOP/s of a product | over the floor |", "|---" * 6 + "|"]
+    others = ["| | ms | |", "|---" * 3 + "|"]
+    for entry in entries:
+        name, notes = f"`{entry['name']}`", []
+        if "peer_ms" in entry:
+            low, high = entry.get("ratio_quartiles", [entry["ratio"]] * 2)
+            ratio = f"{entry['ratio']:g}" + (f" ({low:g} to {high:g})" if low < high else "")
+            lines.append(f"| {name} | {entry['ours_ms']:g} | {entry['peer']} | {entry['peer_ms']:g} | {ratio} |")
+        elif "floor_ms" in entry:
+            cells = (entry[key] for key in ("ours_ms", "floor_ms", "gflop", "gflop_per_second", "over_floor"))
+            floors.append(f"| {name} | " + " | ".join(f"{cell:g}" for cell in cells) + " |")
+        elif entry["name"] == "machine":
+            others.append(f"| machine | | {entry['cpu']}, {entry['threads']} threads, torch {entry['torch']} |")
+        else:
+            notes = [f"{key} {value:,}" for key, value in entry.items() if key not in ("name", "ours_ms", "ours_ms_quartiles")]
+            others.append(f"| {name} | {entry.get('ours_ms', '')} | {', '.join(notes)} |")
+    return "\n".join([*lines, "", *floors, "", *others])
 
 
 def world_table(rows: list[dict[str, str]]) -> str:
