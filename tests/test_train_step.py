@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_offline import BC, CEBORL, RCE
 from sb3_offline.ceborl import PAPER_FORM
+from sb3_offline.ceborl.resampling import WeightedTransitions
 from sb3_offline.common.augmentation import GROUP_SIZE, random_shift
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 
@@ -75,7 +76,7 @@ def recursive(f, weight):
 
 
 def test_default_form(dataset, monkeypatch):
-    n_steps, beta, prior, share, temperature, floor, weight_max = 3, 0.2, 0.5, 0.1, 0.5, 0.05, 1.2
+    n_steps, beta, prior, share, temperature, floor, weight_max, exponent = 3, 0.2, 0.5, 0.1, 0.5, 0.05, 1.2, 0.7
     model = CEBORL(
         "MlpPolicy",
         None,
@@ -89,6 +90,7 @@ def test_default_form(dataset, monkeypatch):
         temperature=temperature,
         advantage_floor=floor,
         weight_max=weight_max,
+        state_exponent=exponent,
         initial_odds=0.5,
         n_action_samples=5,
         seed=0,
@@ -112,9 +114,12 @@ def test_default_form(dataset, monkeypatch):
     state = recursive(v, weight) + (1 - GAMMA) * prior * softplus(-v_examples).mean()
     state += share * recursive(v_examples, example_weight)
 
-    eps = floor * np.exp(f_examples.min(axis=0)).mean()
+    scale = np.exp(f_examples.min(axis=0)).mean()
+    eps = floor * scale
     weights = ((np.exp(f.min(axis=0)) + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
+    weights = np.minimum(weights, weight_max) * np.minimum((np.exp(v) + eps) / scale, 1) ** exponent
+    monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n])
     with th.no_grad():
         mean, log_std = (x.double().numpy() for x in model.actor.gaussian_parameters(model.actor.encode(batch.observations)))
     actions = batch.actions.double().numpy()
@@ -125,7 +130,20 @@ def test_default_form(dataset, monkeypatch):
 
     critic_loss, actor_loss = reading.train()
     assert critic_loss == pytest.approx(beta * a + b + recursive(f, weight) + state, rel=1e-5)
-    assert actor_loss == pytest.approx((np.minimum(weights, weight_max) * regression).mean(), rel=1e-3)
+    np.testing.assert_allclose(model._weighted_transitions.weights[-1], weights, rtol=1e-4)
+    np.testing.assert_array_equal(model._weighted_transitions.steps[-1], batch.steps)
+    assert actor_loss == pytest.approx(regression.mean(), rel=1e-3)
+
+
+def test_transitions_are_drawn_by_weight_from_the_last_batches():
+    th.manual_seed(0)
+    kept = WeightedTransitions(2)
+    for first in (0, 10, 20):
+        kept.add(np.arange(first, first + 2), th.tensor([1.0, 3.0]))
+    steps, counts = np.unique(kept.draw(8000), return_counts=True)
+    np.testing.assert_array_equal(steps, [10, 11, 20, 21])
+    np.testing.assert_allclose(counts / 8000, [0.125, 0.375, 0.125, 0.375], atol=0.03)
+    assert kept.effective_share().item() == pytest.approx(0.8)
 
 
 def test_paper_form(dataset, monkeypatch):
@@ -254,7 +272,7 @@ def test_every_batch_of_images_is_shifted(dataset, monkeypatch):
     sizes, augment = [], model.augment
     monkeypatch.setattr(model, "augment", lambda batch: sizes.append(len(batch)) or augment(batch))
     model.learn(1)
-    assert len(sizes) == 4 and sorted(sizes)[1:] == [8, 8, 8] and 1 <= min(sizes) <= 4  # examples, s, s' and the n-step state
+    assert sorted(sizes)[1:] == [8] * 4 and min(sizes) <= 4  # the examples drawn; s, s', the n-step state, the policy's batch
     batch = model.replay_buffer.sample(8).observations
     assert not th.equal(augment(batch), batch)
 

@@ -14,6 +14,7 @@ from sb3_offline.ceborl.losses import (
     recursive_loss,
     success_odds,
 )
+from sb3_offline.ceborl.resampling import WeightedTransitions
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
 from sb3_offline.common.losses import expectile_loss
 from sb3_offline.data.buffer import OfflineSamples
@@ -86,6 +87,9 @@ class CEBORL(ExampleBasedAlgorithm):
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
     :param advantage_floor: odds, as a share of the examples' odds, under which advantages are noise and count little
     :param weight_max: bound of the advantage weights
+    :param state_exponent: states count by this power of their odds, relative to the examples'. Advantages say which action is
+        better in a state; most states of a mixed dataset lead nowhere, and what is best there matters little.
+    :param policy_batches: the policy learns from the transitions of the last so many batches, drawn by their weights
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels
@@ -125,6 +129,8 @@ class CEBORL(ExampleBasedAlgorithm):
         temperature: float = 0.3,
         advantage_floor: float = 0.01,
         weight_max: float = 100.0,
+        state_exponent: float = 1.0,
+        policy_batches: int = 64,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int = 4,
@@ -172,6 +178,8 @@ class CEBORL(ExampleBasedAlgorithm):
         self.temperature = temperature
         self.advantage_floor = advantage_floor
         self.weight_max = weight_max
+        self.state_exponent = state_exponent
+        self._weighted_transitions = WeightedTransitions(policy_batches)
         self.ent_coef = ent_coef
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
@@ -240,9 +248,12 @@ class CEBORL(ExampleBasedAlgorithm):
                     self.temperature,
                     self.advantage_floor,
                     self.weight_max,
+                    self.state_exponent,
                 )
-                actor_loss = (weights * self.actor.regression_loss(policy_features, batch.actions)).mean()
-                self._record(effective_weights=weights.sum() ** 2 / weights.pow(2).sum() / batch_size)
+                assert batch.steps is not None
+                self._weighted_transitions.add(batch.steps, weights)
+                actor_loss = self.actor.regression_loss(*self._draw_imitated(batch_size)).mean()
+                self._record(effective_weights=self._weighted_transitions.effective_share())
             else:  # Eq. 11
                 actions, log_prob = self.actor.sample(policy_features)
                 classifier = self.critic.values(features.detach(), actions).amin(dim=0).sigmoid()
@@ -259,6 +270,15 @@ class CEBORL(ExampleBasedAlgorithm):
             )
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._record_diagnostics(features, policy_features, discounted_omega / self.gamma)
+
+    def _draw_imitated(self, batch_size: int) -> tuple[th.Tensor, th.Tensor]:
+        """:return: features and actions of the last batches' transitions, drawn by their weights"""
+        steps = self._weighted_transitions.draw(batch_size)
+        observations, actions = self.replay_buffer.pairs(steps, env=self._vec_normalize_env)
+        observations = self.augment(observations)
+        with th.no_grad():
+            features = self.critic.encode(observations)
+        return self._policy_features(observations, features), actions
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         """

@@ -82,10 +82,12 @@ def advantage_weights(
     temperature: float,
     advantage_floor: float,
     weight_max: float,
+    state_exponent: float = 0.0,
 ) -> th.Tensor:
     """
-    How much more the data's action promises than the data's actions do on average in its state:
-    ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature)``.
+    How much more the data's action promises than the data's actions do on average in its state, times how much that state
+    promises: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * ((odds(s) + eps) / odds*) ** state_exponent``,
+    with the examples' mean odds ``odds*``.
 
     A ratio, since odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share of the examples'
     odds: where both odds are far under it, their ratio is noise, and the weight is about 1.
@@ -95,11 +97,15 @@ def advantage_weights(
     :param example_logits: logits of success examples, ``(n_critics, batch)``; the scale of the odds
     :param temperature: the smaller, the sharper
     :param advantage_floor: eps as a share of the examples' mean odds
-    :param weight_max: upper bound
+    :param weight_max: upper bound of the first factor; that of the second is 1
+    :param state_exponent: how much less states count that promise little; 0: all states count alike
     :return: ``(batch,)``
     """
     odds = success_odds(data_logits, OVERFLOW)
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
-    eps = advantage_floor * success_odds(example_logits, OVERFLOW).mean()
-    log_ratio = th.log(odds + eps) - th.log(state_odds + eps)
-    return (log_ratio / temperature).clamp(max=math.log(weight_max)).exp()
+    example_odds = success_odds(example_logits, OVERFLOW).mean()
+    eps = advantage_floor * example_odds
+    log_state_odds = th.log(state_odds + eps)
+    log_ratio = th.log(odds + eps) - log_state_odds
+    log_share = (log_state_odds - th.log(example_odds)).clamp(max=0.0)
+    return ((log_ratio / temperature).clamp(max=math.log(weight_max)) + state_exponent * log_share).exp()

@@ -37,6 +37,7 @@ class OfflineSamples(NamedTuple):
     :param nstep_discounts: (B, 1) gamma ** n'
     :param nstep_rewards: (B, 1) sum of gamma ** k * reward over the n' steps
     :param nstep_dones: (B, 1) float, 1 where the last of the n' steps terminated
+    :param steps: (B,) numbers of the transitions, as :meth:`OfflineReplayBuffer.transitions` takes them
     """
 
     observations: Observations
@@ -51,6 +52,7 @@ class OfflineSamples(NamedTuple):
     nstep_discounts: th.Tensor | None = None
     nstep_rewards: th.Tensor | None = None
     nstep_dones: th.Tensor | None = None
+    steps: np.ndarray | None = None
 
 
 class OfflineReplayBuffer(ReplayBuffer):
@@ -186,10 +188,20 @@ class OfflineReplayBuffer(ReplayBuffer):
             dones=self._column(self.dones[steps]),
             rewards=self._column(self._normalize_reward(self.rewards[steps], env)),
             discounts=self._column(np.full(len(steps), self.gamma)),
+            steps=steps,
         )
         if self.next_actions:
             samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
         return samples._replace(**self._windows(steps, rows, env)) if self.n_steps > 1 else samples
+
+    def pairs(self, steps: np.ndarray, env: VecNormalize | None = None) -> tuple[Observations, th.Tensor]:
+        """
+        :param steps: (B,) step numbers, as for :meth:`transitions`
+        :param env: normalises observations
+        :return: ``observations`` and ``actions`` of these transitions
+        """
+        actions = self._to_device(self.actions.take(steps, axis=0))
+        return self._observations(self._observation_rows[steps], env), actions
 
     def _windows(self, steps: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         ahead = np.minimum(self.n_steps, self._steps_left[steps])
@@ -270,6 +282,20 @@ class OfflineReplayBuffer(ReplayBuffer):
         finally:
             self.n_steps = n_steps
         self.rewards = rewards
+
+    def return_variance(self, gamma: float) -> float:
+        """
+        What ``VecNormalize`` scales rewards by: the variance of the discounted sum of the rewards up to each step.
+
+        :param gamma: discount factor of ``VecNormalize``
+        :return: over all steps
+        """
+        lengths = np.concatenate([dataset.lengths for dataset in self.datasets])
+        starts, returns = np.cumsum(lengths) - lengths, self.rewards.astype(np.float64)
+        for t in range(1, int(lengths.max())):
+            steps = starts[lengths > t] + t
+            returns[steps] += gamma * returns[steps - 1]
+        return float(returns.var())
 
     def observation_statistics(self, keys: Sequence[str] | None = None) -> Any:
         """
