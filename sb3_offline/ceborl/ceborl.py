@@ -129,7 +129,7 @@ class CEBORL(ExampleBasedAlgorithm):
         temperature: float = 0.3,
         advantage_floor: float = 0.01,
         weight_max: float = 100.0,
-        state_exponent: float = 1.0,
+        state_exponent: float = 2.0,
         policy_batches: int = 64,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
