@@ -204,6 +204,19 @@ def test_missing_and_broken_rewards_are_named(folder, tmp_path):
                 model.learn(1)
 
 
+def test_vec_normalize_scales_rewards_by_the_dataset(folder):
+    env = VecNormalize(DummyVecEnv([lambda: SpacesOnlyEnv(STATES, ACTIONS)]), gamma=0.8, clip_reward=100.0)
+    model = CQL("MlpPolicy", env, folder / "states.h5", policy_kwargs=SMALL, reward_fn=lambda batch: 30 * batch.rewards + 20)
+    returns = []
+    for episode in map(partial(make_episode, space=STATES), range(12)):
+        total = 0.0
+        for reward in episode["rewards"]:
+            total = 0.8 * total + 30 * reward + 20
+            returns.append(total)
+    rewards = model.replay_buffer.transitions(np.arange(4), env).rewards
+    np.testing.assert_allclose(rewards[:, 0], model.replay_buffer.rewards[:4] / np.std(returns), rtol=1e-5)
+
+
 @pytest.mark.parametrize("distance", ["l2", "mse"])
 @pytest.mark.parametrize("observations", ["states", "images", "both", "normalised"])
 def test_dcql_rewards_are_distances_to_the_examples(distance, observations, folder):

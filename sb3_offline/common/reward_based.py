@@ -50,6 +50,10 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
     def _prepare_data(self) -> None:
         super()._prepare_data()
         self._relabel()
+        normalize = self._vec_normalize_env
+        if normalize is not None and normalize.norm_reward and normalize.training:
+            # Without a rollout, the scale of a VecNormalize has to come from the dataset.
+            normalize.ret_rms.var = self.replay_buffer.return_variance(normalize.gamma)
 
     def _relabel(self) -> None:
         """Put the rewards that are learned from in place of the dataset's."""
