@@ -1,0 +1,161 @@
+"""A callback that judges a learner by held-out data."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_offline.ceborl import CEBORL
+from sb3_offline.ceborl.losses import success_odds
+from sb3_offline.common.actor_critic import ActorCriticAlgorithm
+from sb3_offline.common.example_based import ExampleSource
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.common.reward_based import RewardBasedAlgorithm
+from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
+from sb3_offline.data.examples import load_examples
+from sb3_offline.data.reader import DatasetSource
+from sb3_offline.evaluation.fitted_q import batches_of, first_steps, fitted_q_evaluation, state_values
+from sb3_offline.evaluation.metrics import judge_probabilities, success_to_come
+from sb3_offline.oril import ORIL
+
+
+class OfflineEvalCallback(BaseCallback):
+    """
+    Judges a model without an environment, and logs under ``offline_eval/`` what applies to it:
+
+    - ``td_error``: mean absolute error of the Bellman equation of the learned policy (for CEBORL and RCE, of the recursion of
+      their probabilities). Small on the training data and large on held-out data: overfitting. Growing: divergence.
+    - ``initial_value``, ``initial_value_std``: what the critic makes of the episodes' first states. Far above
+      ``data_return``, the mean discounted return of the episodes: overestimation.
+    - ``examples_accuracy``, ``_auc``, ``_calibration_error``: how a classifier of success tells held-out examples from
+      held-out data, both counting the same
+    - ``success_accuracy``, ``_auc``, ``_calibration_error``: how it tells states of which success comes from others, where the
+      dataset has success labels
+    - ``fqe_value``: the policy's discounted return by :func:`~sb3_offline.evaluation.fitted_q.fitted_q_evaluation`
+
+    A run with it is the same as one without.
+
+    :param dataset: held-out data, of the same spaces; default: what the model learns from
+    :param examples: held-out success examples, for learners from examples
+    :param eval_freq: gradient steps between two evaluations
+    :param n_transitions: transitions that are looked at, the same ones each time
+    :param fqe_steps: gradient steps of each fitted Q evaluation (0: none), which need rewards
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    """
+
+    model: OfflineAlgorithm
+
+    def __init__(
+        self,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        eval_freq: int = 1000,
+        n_transitions: int = 4096,
+        fqe_steps: int = 0,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        self.dataset, self.examples = dataset, examples
+        self.eval_freq, self.n_transitions, self.fqe_steps = eval_freq, n_transitions, fqe_steps
+
+    def _on_training_start(self) -> None:
+        model = self.model
+        self.buffer = model.replay_buffer
+        if self.dataset is not None:
+            self.buffer = OfflineReplayBuffer(
+                self.dataset, model.observation_space, model.action_space, model.device, gamma=model.gamma
+            )
+        size = self.buffer.size()
+        n = min(self.n_transitions, size)
+        self.steps = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
+        self.example_observations: PyTorchObs | None = None
+        if self.examples is not None:
+            arrays = load_examples(self.examples, model.observation_space)
+            if model._vec_normalize_env is not None:
+                arrays = model._vec_normalize_env.normalize_obs(arrays)
+            if isinstance(arrays, dict):
+                self.example_observations = {key: th.as_tensor(array, device=model.device) for key, array in arrays.items()}
+            else:
+                self.example_observations = th.as_tensor(arrays, device=model.device)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.eval_freq == 0:
+            for name, value in self.evaluate().items():
+                self.logger.record(f"offline_eval/{name}", value)
+        return True
+
+    def evaluate(self) -> dict[str, float]:
+        """
+        :return: what is logged
+        """
+        model = self.model
+        model.policy.set_training_mode(False)  # train() sets it again
+        found: dict[str, float] = {}
+        if isinstance(model, ActorCriticAlgorithm):
+            initial = state_values(model.critic, model, self.buffer, first_steps(self.buffer))
+            found |= {"initial_value": float(initial.mean()), "initial_value_std": float(initial.std())}
+            batches = batches_of(self.buffer, self.steps, model._vec_normalize_env)
+            found["td_error"] = float(np.concatenate([self._td_errors(batch) for batch in batches]).mean())
+        if isinstance(model, CEBORL | ORIL):
+            found |= self._judge_classifier()
+        if self.buffer.has_rewards or isinstance(model, RewardBasedAlgorithm):
+            found["data_return"] = float(discounted_returns(self.buffer, model.gamma).mean())
+            if self.fqe_steps:
+                found["fqe_value"] = float(fitted_q_evaluation(model, self.buffer, self.fqe_steps).mean())
+        return found
+
+    @th.no_grad()
+    def _td_errors(self, batch: OfflineSamples) -> np.ndarray:
+        model: Any = self.model
+        values = model.critic.values(model.critic.encode(batch.observations), batch.actions)
+        actions = model.policy._predict(batch.next_observations, deterministic=True)
+        following = model.critic_target.values(model.critic_target.encode(batch.next_observations), actions)
+        if isinstance(model, CEBORL):
+            omega = model.gamma * success_odds(following, model.omega_max)
+            errors = values.sigmoid() - omega / (1 + omega)
+        else:
+            discounts = model.gamma * (1 - batch.dones.squeeze(1))
+            errors = values - (batch.rewards.squeeze(1) + discounts * following.amin(dim=0))
+        return errors.abs().mean(dim=0).float().cpu().numpy()
+
+    def _judge_classifier(self) -> dict[str, float]:
+        found: dict[str, float] = {}
+        batches = list(batches_of(self.buffer, self.steps, self.model._vec_normalize_env))
+        of_data = np.concatenate([self._probabilities(batch.observations, batch.actions) for batch in batches])
+        if self.example_observations is not None:
+            of_examples = self._probabilities(self.example_observations, None)
+            labels = np.append(np.ones(len(of_examples), dtype=bool), np.zeros(len(of_data), dtype=bool))
+            judged = judge_probabilities(np.append(of_examples, of_data), labels)
+            found |= {f"examples_{name}": value for name, value in judged.items()}
+        datasets = self.buffer.datasets
+        if all(dataset.success is not None for dataset in datasets):
+            labels = np.concatenate([success_to_come(np.asarray(d.success), d.lengths) for d in datasets])[self.steps]
+            if labels.any() and not labels.all():
+                found |= {f"success_{name}": value for name, value in judge_probabilities(of_data, labels).items()}
+        return found
+
+    @th.no_grad()
+    def _probabilities(self, observations: PyTorchObs, actions: th.Tensor | None) -> np.ndarray:
+        """The probability of success; without actions with those of the policy."""
+        model: Any = self.model
+        if isinstance(model, ORIL):
+            model.reward_model.set_training_mode(False)
+            return model.reward_model(observations).sigmoid().float().cpu().numpy()
+        if actions is None:
+            actions = model.policy._predict(observations, deterministic=True)
+        logits = model.critic.values(model.critic.encode(observations), actions).amin(dim=0)
+        return logits.sigmoid().float().cpu().numpy()
+
+
+def discounted_returns(buffer: OfflineReplayBuffer, gamma: float) -> np.ndarray:
+    """
+    :param buffer: with rewards
+    :param gamma: the discount factor
+    :return: (E,) the discounted returns of its episodes
+    """
+    starts = first_steps(buffer)
+    lengths = np.diff(np.append(starts, buffer.size()))
+    discounts = gamma ** (np.arange(buffer.size()) - np.repeat(starts, lengths))
+    return np.add.reduceat(buffer.rewards * discounts, starts)

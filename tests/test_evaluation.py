@@ -1,0 +1,114 @@
+"""Judging without an environment, against what is known exactly."""
+
+import numpy as np
+import pytest
+import torch as th
+from data_files import make_episode, write_dataset
+from gymnasium import spaces
+from test_algorithms import ACTIONS, POLICIES, files, make  # noqa: F401
+
+from sb3_offline import BC, CQL, IQL
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.evaluation import OfflineEvalCallback, fitted_q_evaluation
+from sb3_offline.evaluation.metrics import auc, judge_probabilities, success_to_come
+
+CHAIN = spaces.Discrete(4)
+MOVES = spaces.Box(-1, 1, (1,), np.float32)
+GAMMA = 0.9
+
+
+def write_chain(path, n_episodes=60, n_steps=12):
+    """Four places in a row. Right of the last one the episode terminates with reward 10; each step costs 1. Random moves."""
+    rng = np.random.default_rng(0)
+    with DatasetWriter(path, CHAIN, MOVES, success=True) as writer:
+        for _ in range(n_episodes):
+            place, places, moves, rewards = 0, [0], [], []
+            while place < 4 and len(moves) < n_steps:
+                moves.append(rng.uniform(-1, 1, 1).astype(np.float32))
+                place = max(place + (1 if moves[-1] > 0 else -1), 0)
+                rewards.append(10.0 if place == 4 else -1.0)
+                places.append(min(place, 3))  # after the end nothing counts
+            terminated = np.zeros(len(moves), dtype=bool)
+            terminated[-1] = place == 4
+            writer.add_episode(np.array(places), np.stack(moves), rewards=rewards, terminated=terminated, success=terminated)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("goes_right", "exact"), [(True, 10 * GAMMA**3 - (1 - GAMMA**3) / (1 - GAMMA)), (False, -1 / (1 - GAMMA))]
+)
+def test_fitted_q_evaluation_gives_the_exact_value(tmp_path, goes_right, exact):
+    model = IQL("MlpPolicy", None, write_chain(tmp_path / "d.h5"), gamma=GAMMA, seed=0, policy_kwargs={"net_arch": [32]})
+    with th.no_grad():
+        model.actor.mu.weight.zero_()
+        model.actor.mu.bias.fill_(1.0 if goes_right else -1.0)
+    before, state = {k: v.clone() for k, v in model.policy.state_dict().items()}, th.get_rng_state()
+    values = fitted_q_evaluation(model, n_steps=1000, batch_size=64, learning_rate=5e-3, tau=0.1)
+    assert values.shape == (60,)
+    np.testing.assert_allclose(values, exact, atol=0.5)
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+    assert th.equal(th.get_rng_state(), state)
+
+
+def test_a_run_is_the_same_with_and_without_and_logs_what_applies(files, tmp_path):  # noqa: F811
+    write_dataset(tmp_path / "held_out.h5", 4, POLICIES["MlpPolicy"], first=20)
+    wanted = {
+        "bc": {"data_return", "fqe_value"},
+        "cql": {"data_return", "fqe_value", "td_error", "initial_value", "initial_value_std"},
+    }
+    judged = {f"{kind}_{name}" for kind in ("examples", "success") for name in ("accuracy", "auc", "calibration_error")}
+    wanted["ceborl"] = wanted["oril"] = wanted["cql"] | judged
+    for algo, names in wanted.items():
+        examples = files["MlpPolicy"][1]
+        callback = OfflineEvalCallback(str(tmp_path / "held_out.h5"), examples, eval_freq=2, fqe_steps=2)
+        model = make(algo, "MlpPolicy", files).learn(3, callback, log_interval=None)
+        logged = {name.split("/")[1]: value for name, value in model.logger.name_to_value.items() if "offline_eval" in name}
+        assert logged.keys() == names and np.isfinite(list(logged.values())).all()
+        plain = make(algo, "MlpPolicy", files).learn(3, log_interval=None)
+        for name, value in model.policy.state_dict().items():
+            assert th.equal(value, plain.policy.state_dict()[name]), name
+
+
+def test_td_error_and_returns_are_those_of_their_definition(tmp_path):
+    """A critic that says 7 everywhere, on a chain whose rewards are -1 and, where it ends, 10."""
+    model = CQL("MlpPolicy", None, write_chain(tmp_path / "d.h5"), gamma=GAMMA, seed=0, policy_kwargs={"net_arch": [8]})
+    callback = OfflineEvalCallback(n_transitions=10**6)
+    callback.init_callback(model)
+    callback._on_training_start()
+    with th.no_grad():
+        for critic in (model.critic, model.critic_target):
+            for head in critic.q_networks:
+                head[-1].weight.zero_(), head[-1].bias.fill_(7.0)
+    found = callback.evaluate()
+    share = model.replay_buffer.dones.mean()
+    assert found["td_error"] == pytest.approx(share * 3 + (1 - share) * abs(7 - (-1 + GAMMA * 7)), rel=1e-5)
+    assert found["initial_value"] == pytest.approx(7) and found["initial_value_std"] == pytest.approx(0)
+    dataset = model.replay_buffer.datasets[0]
+    returns = []
+    for start, n in zip(dataset.step_starts, dataset.lengths, strict=True):
+        returns.append(sum(GAMMA**t * dataset.rewards[start + t] for t in range(n)))
+    assert found["data_return"] == pytest.approx(np.mean(returns), rel=1e-5)
+
+
+def test_probabilities_are_judged_by_what_they_say():
+    rng = np.random.default_rng(0)
+    probabilities = rng.uniform(size=100_000)
+    labels = rng.uniform(size=100_000) < probabilities
+    judged = judge_probabilities(probabilities, labels)  # calibrated, half of them positive
+    assert judged["calibration_error"] < 0.01 and judged["accuracy"] == pytest.approx(0.75, abs=0.01)
+    assert judged["auc"] == pytest.approx(5 / 6, abs=0.01)
+    assert judge_probabilities(np.array([0.9, 0.9, 0.9, 0.9]), np.array([True, False, True, False]))[
+        "calibration_error"
+    ] == pytest.approx(0.4)
+    assert auc(np.array([1, 2, 2, 3]), np.array([False, False, True, True])) == pytest.approx(3.5 / 4)
+    come = success_to_come(np.array([0, 1, 0, 0, 0, 1], dtype=bool), np.array([3, 1, 2]))
+    assert come.tolist() == [True, True, False, False, True, True]
+
+
+def test_data_without_rewards_cannot_be_evaluated_on(tmp_path):
+    episode = make_episode(0, POLICIES["MlpPolicy"])
+    with DatasetWriter(tmp_path / "d.h5", POLICIES["MlpPolicy"], ACTIONS, rewards=False, success=False) as writer:
+        writer.add_episode(episode["observations"], episode["actions"])
+    with pytest.raises(DatasetError, match="rewards: are missing, so a policy has no value"):
+        fitted_q_evaluation(BC("MlpPolicy", None, str(tmp_path / "d.h5")), n_steps=1)
