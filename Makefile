@@ -6,7 +6,7 @@ TORCH ?= torch==2.13.0
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo demo-pixels states-table test test-slow pytest lint type format check-codestyle commit-checks doc clean
+.PHONY: demo demo-pixels states-table test test-slow test-sb3 pytest lint type format check-codestyle commit-checks doc clean
 
 demo: $(READY)  ## the main job: collect, train CEBORL, evaluate, report into demo/ (about 15 minutes)
 	$(BIN)/sb3-offline demo --output demo
@@ -19,6 +19,9 @@ states-table: $(READY)  ## all methods on all tasks from states, three seeds, in
 
 test: $(READY)  ## all fast tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-sb3: $(READY)  ## the test-suite of Stable-Baselines3 with each algorithm in the place of SAC
+	OMP_NUM_THREADS=1 $(BIN)/python tests/sb3_suite
 
 test-slow: $(READY)  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m slow

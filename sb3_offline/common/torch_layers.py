@@ -33,7 +33,7 @@ class StandardizedExtractor(FlattenExtractor):
         self.std_min = std_min
         self.register_buffer("mean", th.zeros(self.features_dim))
         self.register_buffer("std", th.ones(self.features_dim))
-        self.register_buffer("fitted", th.tensor(False))
+        self.register_buffer("fitted", th.zeros(()))  # 1 once it is; a float, as all parameters in SB3
 
     def fit(self, mean: np.ndarray, variance: np.ndarray) -> None:
         """
@@ -42,7 +42,7 @@ class StandardizedExtractor(FlattenExtractor):
         """
         self.mean.copy_(th.as_tensor(mean, dtype=th.float32).flatten())
         self.std.copy_(th.as_tensor(np.sqrt(variance), dtype=th.float32).flatten().clamp(min=self.std_min))
-        self.fitted.fill_(True)
+        self.fitted.fill_(1.0)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return (super().forward(observations) - self.mean) / self.std

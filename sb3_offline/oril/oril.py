@@ -104,7 +104,7 @@ class ORIL(ExampleBasedAlgorithm, CQL):
                 reward_examples=example_logits.sigmoid().mean(),
                 reward_data=data_logits.sigmoid().mean(),
             )
-        model.trained.fill_(True)
+        model.trained.fill_(1.0)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -33,7 +33,7 @@ class RewardClassifier(BaseModel):
     ):
         super().__init__(observation_space, action_space, features_extractor=features_extractor, **kwargs)
         self.head = nn.Sequential(*create_mlp(features_extractor.features_dim, 1, net_arch))
-        self.register_buffer("trained", th.tensor(False))
+        self.register_buffer("trained", th.zeros(()))  # 1 once it is
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """
