@@ -196,6 +196,9 @@ def test_missing_and_broken_rewards_are_named(folder, tmp_path):
         CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL, reward_fn="success").learn(1)
     with pytest.raises(TypeError, match="reward_fn is 'succes'"):
         CQL("MlpPolicy", None, with_none, reward_fn="succes")
+    for algorithm in (DCQL, ORIL):
+        with pytest.raises(TypeError, match="makes its rewards of the examples"):
+            algorithm("MlpPolicy", None, with_none, EXAMPLES, reward_fn="success")
     CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL, reward_fn=lambda batch: th.ones(len(batch.dones), 1)).learn(1)
     for broken in (lambda batch: batch.actions, lambda batch: batch.rewards * np.nan, lambda batch: 1.0):
         model = CQL("MlpPolicy", None, folder / "states.h5", policy_kwargs=SMALL, reward_fn=broken)

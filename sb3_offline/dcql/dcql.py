@@ -47,6 +47,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
         ent_coef: float | str = 1e-4,
         **kwargs: Any,
     ):
+        if "reward_fn" in kwargs:
+            raise TypeError("DCQL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
         if distance not in ("l2", "mse"):
             raise TypeError(f"DCQL: distance is {distance!r}; choose 'l2' or 'mse'")
         self.distance = distance

@@ -55,6 +55,8 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         ent_coef: float | str = 1e-4,
         **kwargs: Any,
     ):
+        if "reward_fn" in kwargs:
+            raise TypeError("ORIL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
         self.reward_steps = reward_steps
         self.reward_learning_rate = reward_learning_rate
         self.positive_prior = positive_prior
