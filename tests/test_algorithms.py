@@ -161,6 +161,16 @@ def test_shipped_configs_fit_their_algorithm(algo, files):
         create_model(algo, config, dataset, examples if needs_examples(algo) else None)
 
 
+@pytest.mark.parametrize("algo", ALGOS)
+def test_actions_of_two_axes_and_networks_without_hidden_layers(algo, tmp_path):
+    actions, rng = spaces.Box(-1, 1, (2, 3), np.float32), np.random.default_rng(0)
+    with DatasetWriter(tmp_path / "d.h5", STATES, actions, success=False) as writer:
+        writer.add_episode(rng.normal(size=(10, 3)), rng.uniform(-1, 1, (9, 2, 3)), rewards=np.zeros(9))
+    kwargs = {"examples": rng.normal(size=(4, 3))} if needs_examples(algo) else {}
+    model = ALGOS[algo]("MlpPolicy", None, tmp_path / "d.h5", batch_size=4, policy_kwargs={"net_arch": []}, **kwargs).learn(2)
+    assert model.predict(STATES.sample())[0].shape == (2, 3)
+
+
 def test_no_environment_says_so(files):
     model = make("bc", "MlpPolicy", files)
     assert model.observation_space == STATES and model.action_space == ACTIONS

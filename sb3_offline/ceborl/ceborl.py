@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
 from sb3_offline.ceborl.losses import (
@@ -330,7 +331,7 @@ class CEBORL(ExampleBasedAlgorithm):
         :return: K actions from mu for each state, ``(batch, K, action_dim)``, no gradient
         """
         n_policy = {"uniform": 0, "mixture": self.n_action_samples // 2, "policy": self.n_action_samples}[self.mu]
-        action_dim = self.actor.action_space.shape[0]
+        action_dim = get_action_dim(self.action_space)
         uniform = 2.0 * th.rand(len(features), self.n_action_samples - n_policy, action_dim, device=self.device) - 1.0
         if n_policy == 0:
             return uniform
