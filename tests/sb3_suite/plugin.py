@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         (taken if takes_sac(item) else others).append(item)
     for item in taken:
-        why = reason(item.nodeid)
+        why = reason(NAME, item.nodeid)
         if why:
             item.add_marker(pytest.mark.skip(reason=why))
     config.hook.pytest_deselected(items=others)
