@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
@@ -53,7 +54,7 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
         normalize = self._vec_normalize_env
         if normalize is not None and normalize.norm_reward and normalize.training:
             # Without a rollout, the scale of a VecNormalize has to come from the dataset.
-            normalize.ret_rms.var = self.replay_buffer.return_variance(normalize.gamma)
+            normalize.ret_rms.var = np.array(self.replay_buffer.return_variance(normalize.gamma))
 
     def _relabel(self) -> None:
         """Put the rewards that are learned from in place of the dataset's."""
