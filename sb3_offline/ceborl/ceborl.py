@@ -257,7 +257,7 @@ class CEBORL(ExampleBasedAlgorithm):
                 self._record(effective_weights=self._weighted_transitions.effective_share())
             else:  # Eq. 11
                 actions, log_prob = self.actor.sample(policy_features)
-                classifier = self.critic.values(features.detach(), actions).amin(dim=0).sigmoid()
+                classifier = self._values_of_policy(features, actions).amin(dim=0).sigmoid()
                 actor_loss = (self.ent_coef * log_prob - classifier).mean()
             self._optimize(self.actor.optimizer, actor_loss)
 

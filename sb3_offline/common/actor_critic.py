@@ -52,6 +52,21 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         own = self.actor.encode(observations)
         return own if rows is None else own[rows]
 
+    def _values_of_policy(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        The critics' values of the policy's own actions, for the actor's loss: their gradient goes to the actions alone.
+
+        :param features: of the critic's encoder, ``(batch, features_dim)``
+        :param actions: ``(batch, action_dim)`` in [-1, 1]
+        :return: ``(n_critics, batch)``
+        """
+        heads = th.nn.ModuleList(self.critic.q_networks)
+        heads.requires_grad_(False)  # or the gradients of their weights would be computed and thrown away
+        try:
+            return self.critic.values(features.detach(), actions)
+        finally:
+            heads.requires_grad_(True)
+
     def _update_target(self) -> None:
         if self._n_updates % self.target_update_interval == 0:
             with th.no_grad():

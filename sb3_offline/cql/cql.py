@@ -165,7 +165,7 @@ class CQL(RewardBasedAlgorithm):
             critic_loss = bellman_loss(data_values, targets) + self._conservative_term(gaps)
             self._optimize(self.critic.optimizer, critic_loss)
 
-            values = self.critic.values(features.detach(), actions).amin(dim=0)
+            values = self._values_of_policy(features, actions).amin(dim=0)
             actor_loss = (ent_coef * log_prob - values).mean()
             self._optimize(self.actor.optimizer, actor_loss)
 

@@ -138,7 +138,7 @@ class TD3BC(RewardBasedAlgorithm):
             self._n_updates += 1
             if self._n_updates % self.policy_delay == 0:
                 actions = self.actor.act(self._policy_features(observations, features))
-                policy_values = self.critic.values(features.detach(), actions)[0]
+                policy_values = self._values_of_policy(features, actions)[0]
                 imitation_loss = F.mse_loss(actions, batch.actions)
                 actor_loss = imitation_loss - self.alpha / policy_values.abs().mean().detach() * policy_values.mean()
                 self._optimize(self.actor.optimizer, actor_loss)
