@@ -78,7 +78,8 @@ def main() -> None:
         group = next(group for group, members in GROUPS.items() if name in members)
         change = ", ".join(f"{key}={value}" for key, value in VARIANTS[name].items())
         cells.append(({"group": group, "variant": name, "task": task, "seed": seed, "config": change}, run))
-    train_cells([run for _, run in cells], args.workers)
+    if not args.no_training:
+        train_cells([run for _, run in cells], args.workers)
     write_rows(args.output, cells)
     plot(args.output, args.figure)
 

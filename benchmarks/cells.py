@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser, runs: str, output: str, tasks
     parser.add_argument("--runs", type=Path, default=Path(runs))
     parser.add_argument("--output", type=Path, default=ROOT / "results" / output)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--no-training", action="store_true", help="write the table of the cells that are finished")
 
 
 def prepare_data(args: argparse.Namespace) -> None:

@@ -39,7 +39,8 @@ def main() -> None:
         run = cell_run(args, algo, {**load_config(config_name, ENV_ID), **changes}, method, task, seed)
         config = " ".join([config_name, *(f"{key}={value}" for key, value in changes.items())])
         cells.append(({"method": method, "task": task, "seed": seed, "config": config}, run))
-    train_cells([run for _, run in cells], args.workers)
+    if not args.no_training:
+        train_cells([run for _, run in cells], args.workers)
     write_rows(args.output, cells)
 
 
