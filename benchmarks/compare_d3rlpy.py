@@ -3,7 +3,7 @@ CQL, IQL and TD3+BC beside those of d3rlpy: the same data, networks, hyperparame
 
     python benchmarks/compare_d3rlpy.py
 
-collects the dataset (all steps that SB3's SAC takes while it learns Pendulum-v1), trains with both libraries, plays 20
+collects the dataset (all steps that SB3's SAC takes while it learns Pendulum-v1), trains with both libraries, plays 10
 episodes with each final policy, the same ones for all, and writes results/compare_d3rlpy.csv. Rows that are there are kept, so
 it can be stopped and started again. d3rlpy has to be installed, see CONTRIBUTING.md.
 """
@@ -32,8 +32,8 @@ ENV_ID, EPISODE_STEPS = "Pendulum-v1", 200
 FIELDS = ("algorithm", "library", "seed", "gradient_steps", "episodes", "mean_return", "std_return")
 #: Rewards are divided by this: values of some hundreds take networks long to reach.
 REWARD_DIVISOR = 10.0
-#: Fewer than the default, which would take most of the time of all.
-N_ACTION_SAMPLES = 4
+#: Of both libraries. Small and fast: the question is whether they agree, not how far they get.
+BATCH_SIZE, LEARNING_RATE, TAU, GAMMA, N_ACTION_SAMPLES = 128, 1e-3, 0.02, 0.95, 4
 ROOT = Path(__file__).resolve().parent.parent
 
 OURS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -41,7 +41,6 @@ OURS: dict[str, tuple[Any, dict[str, Any]]] = {
     "IQL": (IQL, {}),
     "TD3+BC": (TD3BC, {}),
 }
-LEARNING_RATES = {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4}
 THEIRS: dict[str, tuple[Any, dict[str, Any]]] = {
     # No learning rate of alpha: it stays at 1. The factor in front of the penalty is another argument there.
     "CQL": (
@@ -49,7 +48,7 @@ THEIRS: dict[str, tuple[Any, dict[str, Any]]] = {
         {
             "conservative_weight": 1.0,
             "alpha_learning_rate": 0.0,
-            "temp_learning_rate": 3e-4,
+            "temp_learning_rate": LEARNING_RATE,
             "n_action_samples": N_ACTION_SAMPLES,
         },
     ),
@@ -76,7 +75,18 @@ def collect(path: Path, n_steps: int) -> None:
 def train_ours(name: str, path: Path, n_steps: int, seed: int) -> Any:
     """:return: the trained model"""
     algorithm, settings = OURS[name]
-    return algorithm("MlpPolicy", None, str(path), seed=seed, **settings).learn(n_steps, log_interval=None)
+    model = algorithm(
+        "MlpPolicy",
+        None,
+        str(path),
+        learning_rate=LEARNING_RATE,
+        batch_size=BATCH_SIZE,
+        tau=TAU,
+        gamma=GAMMA,
+        seed=seed,
+        **settings,
+    )
+    return model.learn(n_steps, log_interval=None)
 
 
 class TheirPolicy:
@@ -107,7 +117,11 @@ def train_theirs(name: str, path: Path, n_steps: int, seed: int) -> TheirPolicy:
     )
     config, settings = THEIRS[name]
     algorithm = config(
-        **LEARNING_RATES,
+        actor_learning_rate=LEARNING_RATE,
+        critic_learning_rate=LEARNING_RATE,
+        batch_size=BATCH_SIZE,
+        tau=TAU,
+        gamma=GAMMA,
         **settings,
         observation_scaler=StandardObservationScaler(),
         action_scaler=MinMaxActionScaler(minimum=dataset.action_space.low, maximum=dataset.action_space.high),
@@ -120,9 +134,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/pendulum_replay.h5"), help="collected where it is missing")
     parser.add_argument("--data-steps", type=int, default=10_000)
-    parser.add_argument("--steps", type=int, default=3000, help="gradient steps")
+    parser.add_argument("--steps", type=int, default=2000, help="gradient steps")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--output", type=Path, default=ROOT / "results" / "compare_d3rlpy.csv")
     args = parser.parse_args()
 
