@@ -3,8 +3,8 @@ What the data cost: sampling, memory, opening, converting, growth of a dataset; 
 
     python benchmarks/data_throughput.py --scratch /tmp
 
-Writes a made-up dataset of 375,000 frames of 64x64x3 (4.6 GB), and one of 1,000,000 (12.3 GB), into a folder that is removed at the
-end, and adds its entries to results/throughput.json and a figure to docs/images. Leave the machine alone meanwhile.
+Writes made-up datasets of frames of 64x64x3 into a folder that is removed at the end (the largest, of 1,000,000 frames, takes
+12.3 GB), and adds its entries to results/throughput.json and a figure to docs/images. Leave the machine alone meanwhile.
 """
 
 import argparse
@@ -97,7 +97,7 @@ def child_memory(path: str) -> dict[str, float]:
     buffer = OfflineReplayBuffer(path, _channel_first(), ACTIONS, "cpu", n_steps=10, storage="memory", seed=0)
     for _ in range(20):
         buffer.sample(BATCH_SIZE)
-    return {"bytes": _resident_bytes() - before, "raw": OfflineDataset(path).n_observations * FRAME_BYTES}
+    return {"bytes": _resident_bytes() - before, "raw": len(OfflineDataset(path).observations) * FRAME_BYTES}
 
 
 def child_mapped_sampling(path: str) -> dict[str, Any]:
@@ -105,8 +105,9 @@ def child_mapped_sampling(path: str) -> dict[str, Any]:
 
 
 def _resident_bytes() -> int:
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """:return: memory of this process's own; pages of mapped files are the system's, which takes them back when it likes"""
+    with open("/proc/self/status") as file:
+        return 1024 * int(next(line for line in file if line.startswith("RssAnon")).split()[1])
 
 
 def forget_pages(path: Path) -> None:

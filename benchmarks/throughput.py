@@ -4,10 +4,10 @@ How long a gradient step takes: this library, d3rlpy and Stable-Baselines3, in t
     pip install --no-deps d3rlpy==2.8.1
     python benchmarks/throughput.py
 
-Every learner takes whole steps, sampling included, from the same made-up transitions (batch 256; 256 examples; K = 16; frames of
-64x64x3; PyTorch's default number of threads). The learners take turns, a few steps each, for several rounds; a time is the median
-over all steps, a ratio the median over the rounds of peer / ours, with its quartiles. Writes results/throughput.json and
-docs/images/throughput.png. Leave the machine alone meanwhile.
+Every learner takes whole steps, sampling included, from the same made-up transitions (batch 256; 256 examples; K = 16;
+frames of 64x64x3; PyTorch's default number of threads). The learners take turns, a few steps each, for several rounds; a
+time is the median over all steps, a ratio the median over the rounds of peer / ours, with its quartiles. Writes
+results/throughput.json and docs/images/throughput.png. Leave the machine alone meanwhile.
 """
 
 import argparse

@@ -8,8 +8,8 @@ class WeightedTransitions:
     """
     The transitions of the last batches, drawn again in proportion to their weights.
 
-    A weighted loss over a uniform batch learns from the few transitions that have weight: one in twenty where the data hold
-    five tasks, of which each is solved now and then. Drawn by weight, all of a batch count alike, and the expectation is the same.
+    A weighted loss over a uniform batch learns from the few transitions that have weight: one in fifteen where the data hold
+    five tasks, each solved now and then. Drawn by weight, all of a batch count alike, and the expectation is the same.
 
     :param n_batches: how many batches are kept; weights are as old as the oldest of them at most
     """
