@@ -135,16 +135,20 @@ def library_table(rows: list[dict[str, str]]) -> str:
 
 
 def online_table(rows: list[dict[str, str]]) -> str:
-    """A row a method, a column a number of environment steps: mean return and range over the seeds."""
-    steps = sorted({int(row["env_step"]) for row in rows})[::2]
-    lines = ["| method | seeds | " + " | ".join(f"step {step}" for step in steps) + " |", "|---" * (2 + len(steps)) + "|"]
+    """A row a method, a column a number of environment steps: the mean return and, of several seeds, the range; the lowest."""
+    steps = sorted({int(row["env_step"]) for row in rows})
+    shown = steps[::2]
+    header = ["method", "seeds", *(f"step {step}" for step in shown), f"lowest after step {steps[0]}"]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
-        cells = []
-        for step in steps:
+        cells = [method, ", ".join(dict.fromkeys(row["seed"] for row in own))]
+        for step in shown:
             returns = [float(row["mean_return"]) for row in own if int(row["env_step"]) == step]
-            cells.append(f"{statistics.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})")
-        lines.append(f"| {method} | {', '.join(dict.fromkeys(row['seed'] for row in own))} | " + " | ".join(cells) + " |")
+            spread = f" ({min(returns):.0f} to {max(returns):.0f})" if len(returns) > 1 else ""
+            cells.append(f"{statistics.mean(returns):.0f}{spread}")
+        cells.append(f"{min(float(row['mean_return']) for row in own if int(row['env_step']) > steps[0]):.0f}")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
