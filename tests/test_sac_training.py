@@ -22,7 +22,7 @@ SMALL = {
     "batch_size": 16,
     "scaled_states": True,
     "target_entropy": -1.0,
-    "ou_noise": 0.2,
+    "ou_noise": (0.2, 0.01),
 }
 
 

@@ -119,7 +119,7 @@ def test_default_form(dataset, monkeypatch):
     weights = ((np.exp(f.min(axis=0)) + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
     weights = np.minimum(weights, weight_max) * np.minimum((np.exp(v) + eps) / scale, 1) ** exponent
-    monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n])
+    monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n].numpy())
     with th.no_grad():
         mean, log_std = (x.double().numpy() for x in model.actor.gaussian_parameters(model.actor.encode(batch.observations)))
     actions = batch.actions.double().numpy()
@@ -139,7 +139,7 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
     th.manual_seed(0)
     kept = WeightedTransitions(2)
     for first in (0, 10, 20):
-        kept.add(np.arange(first, first + 2), th.tensor([1.0, 3.0]))
+        kept.add(th.arange(first, first + 2), th.tensor([1.0, 3.0]))
     steps, counts = np.unique(kept.draw(8000), return_counts=True)
     np.testing.assert_array_equal(steps, [10, 11, 20, 21])
     np.testing.assert_allclose(counts / 8000, [0.125, 0.375, 0.125, 0.375], atol=0.03)

@@ -16,12 +16,12 @@ class WeightedTransitions:
 
     def __init__(self, n_batches: int):
         self.n_batches = n_batches
-        self.steps: list[np.ndarray] = []
+        self.steps: list[th.Tensor] = []
         self.weights: list[th.Tensor] = []
 
-    def add(self, steps: np.ndarray, weights: th.Tensor) -> None:
+    def add(self, steps: th.Tensor, weights: th.Tensor) -> None:
         """
-        :param steps: (batch,) numbers of the transitions in the dataset
+        :param steps: (batch,) int64 on the CPU, numbers of the transitions in the dataset
         :param weights: ``(batch,)``, positive, no gradient
         """
         self.steps = [*self.steps, steps][-self.n_batches :]
@@ -33,7 +33,7 @@ class WeightedTransitions:
         :return: (n,) numbers of transitions, with replacement
         """
         drawn = th.multinomial(th.cat(self.weights), n, replacement=True)
-        return np.concatenate(self.steps)[drawn.cpu().numpy()]
+        return th.cat(self.steps)[drawn.cpu()].numpy()
 
     def effective_share(self) -> th.Tensor:
         """:return: scalar, the part of the transitions that would carry as much if all had the same weight"""

@@ -37,7 +37,7 @@ class OfflineSamples(NamedTuple):
     :param nstep_discounts: (B, 1) gamma ** n'
     :param nstep_rewards: (B, 1) sum of gamma ** k * reward over the n' steps
     :param nstep_dones: (B, 1) float, 1 where the last of the n' steps terminated
-    :param steps: (B,) numbers of the transitions, as :meth:`OfflineReplayBuffer.transitions` takes them
+    :param steps: (B,) int64 on the CPU, numbers of the transitions, as :meth:`OfflineReplayBuffer.transitions` takes them
     """
 
     observations: Observations
@@ -52,7 +52,7 @@ class OfflineSamples(NamedTuple):
     nstep_discounts: th.Tensor | None = None
     nstep_rewards: th.Tensor | None = None
     nstep_dones: th.Tensor | None = None
-    steps: np.ndarray | None = None
+    steps: th.Tensor | None = None
 
 
 class OfflineReplayBuffer(ReplayBuffer):
@@ -188,7 +188,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             dones=self._column(self.dones[steps]),
             rewards=self._column(self._normalize_reward(self.rewards[steps], env)),
             discounts=self._column(np.full(len(steps), self.gamma)),
-            steps=steps,
+            steps=th.as_tensor(steps),
         )
         if self.next_actions:
             samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
