@@ -22,7 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from throughput import ACTIONS, BATCH_SIZE, OBSERVATIONS, RESULTS, interleave, merge, ours
+from throughput import ACTIONS, BATCH_SIZE, OBSERVATIONS, RESULTS, interleave, merge, ours, write_transitions
 
 import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.common.augmentation import random_shift
@@ -172,8 +172,6 @@ def growth_entries(folder: Path, sizes: tuple[int, ...], seconds: float) -> list
         entries.append({"name": "growth_frames", "frames": size, "ours_ms": round(float(np.median(np.concatenate(times))), 1)})
         path.unlink()
     path = folder / "states.h5"
-    from throughput import write_transitions
-
     write_transitions(path, OBSERVATIONS["states"])
     for k in (1, 4, 8, 16, 32, 64):
         times = interleave({"step": ours("ceborl", "states", path, False, n_action_samples=k)}, 2, seconds)["step"]

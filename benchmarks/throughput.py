@@ -150,7 +150,7 @@ def _linear_flop(x_shape: Any, weight_shape: Any, *args: Any, out_shape: Any = N
     return 2 * int(np.prod(x_shape)) * weight_shape[0]
 
 
-def floor_entry(name: str, kind: str, step: Step, median_ms: float, mixed_precision: bool, n_bytes: int) -> dict[str, Any]:
+def floor_entry(name: str, step: Step, median_ms: float, mixed_precision: bool, n_bytes: int) -> dict[str, Any]:
     """Operations of a step over the rate of a large product, and the batch's bytes over the rate of a copy."""
     with FlopCounterMode(display=False) as counter:
         step()
@@ -210,7 +210,7 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     for suffix in ("", "_bf16"):
         median = float(np.median(np.concatenate(times[f"ceborl{suffix}"])))
         n_bytes = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)
-        entries.append(floor_entry(f"ceborl_{kind}{suffix}", kind, steps[f"ceborl{suffix}"], median, bool(suffix), n_bytes))
+        entries.append(floor_entry(f"ceborl_{kind}{suffix}", steps[f"ceborl{suffix}"], median, bool(suffix), n_bytes))
     return entries
 
 

@@ -276,10 +276,7 @@ class CEBORL(ExampleBasedAlgorithm):
         """:return: features and actions of the last batches' transitions, drawn by their weights"""
         steps = self._weighted_transitions.draw(batch_size)
         observations, actions = self.replay_buffer.pairs(steps, env=self._vec_normalize_env)
-        observations = self.augment(observations)
-        with th.no_grad():
-            features = self.critic.encode(observations)
-        return self._policy_features(observations, features), actions
+        return self.actor.encode(self.augment(observations)), actions
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         """

@@ -3,6 +3,8 @@
 import numpy as np
 import torch as th
 
+from sb3_offline.common.losses import effective_share
+
 
 class WeightedTransitions:
     """
@@ -37,5 +39,4 @@ class WeightedTransitions:
 
     def effective_share(self) -> th.Tensor:
         """:return: scalar, the part of the transitions that would carry as much if all had the same weight"""
-        weights = th.cat(self.weights)
-        return weights.sum() ** 2 / weights.pow(2).sum() / len(weights)
+        return effective_share(th.cat(self.weights))

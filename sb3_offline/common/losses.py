@@ -23,3 +23,11 @@ def expectile_loss(errors: th.Tensor, expectile: float) -> th.Tensor:
     :return: scalar
     """
     return (th.abs(expectile - (errors < 0).to(errors.dtype)) * errors.pow(2)).mean()
+
+
+def effective_share(weights: th.Tensor) -> th.Tensor:
+    """
+    :param weights: ``(n,)``, positive
+    :return: scalar, the part of the weights that would carry as much if all were the same
+    """
+    return weights.sum() ** 2 / weights.pow(2).sum() / len(weights)

@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_offline.common.losses import bellman_loss, expectile_loss
+from sb3_offline.common.losses import bellman_loss, effective_share, expectile_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.iql.losses import advantage_weights
@@ -135,5 +135,5 @@ class IQL(RewardBasedAlgorithm):
                 actor_loss=actor_loss,
                 values_data=values.mean(),
                 advantage=advantages.mean(),
-                effective_weights=weights.sum() ** 2 / weights.pow(2).sum() / batch_size,
+                effective_weights=effective_share(weights),
             )
