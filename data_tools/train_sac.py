@@ -50,6 +50,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "base": {**_BASE, "policy_kwargs": {"net_arch": [128, 128]}},
     "explore": {**_EXPLORE, "policy_kwargs": {"net_arch": [128, 128]}},
     "bold": {**_BOLD, "policy_kwargs": {"net_arch": [128, 128]}},
+    "n_step": {**_BOLD, "n_steps": 3, "train_freq": 1, "learning_rate": 5e-4, "policy_kwargs": {"net_arch": [128, 128]}},
 }
 """
 Arguments of SAC by name, and two of this program: `scaled_states`, whether the networks see the state shifted and scaled (the
