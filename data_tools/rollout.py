@@ -15,8 +15,16 @@ import numpy as np
 import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.envs.multimodal_metaworld import TASKS
+from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
 
 ENV_ID = "MultimodalMetaworld-v0"
+_EXTRAS: dict[str, tuple[tuple[int, ...], str]] = {
+    "task_success": ((5,), "bool"),
+    "task_reward": ((5,), "float32"),
+    "state": ((len(STATE_NAMES),), "float32"),
+    "scene_state": ((30,), "float64"),
+}
+"""Of `TaskEpisode`: shape of a row and dtype, by name."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +38,7 @@ class TaskEpisode:
     :param actions: (T, 4) float32
     :param task_success: (T, 5) bool, after each decision
     :param task_reward: (T, 5) float32
+    :param state: (T, 21) float32, the environment's state observation after each decision, whatever it observes
     :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision, to draw it again to the byte
     """
 
@@ -39,6 +48,7 @@ class TaskEpisode:
     actions: np.ndarray
     task_success: np.ndarray
     task_reward: np.ndarray
+    state: np.ndarray
     scene_state: np.ndarray
 
     @property
@@ -75,7 +85,7 @@ def roll_out(env: gym.Env, task: str, seed: int, act: Callable[[int, bool], np.n
     observation, _ = env.reset(seed=seed)
     observations = [observation]
     actions: list[np.ndarray] = []
-    successes, rewards, states = [], [], []
+    successes, rewards, states, scene_states = [], [], [], []
     solved = truncated = False
     while not truncated:
         action = act(len(actions), solved)
@@ -85,8 +95,10 @@ def roll_out(env: gym.Env, task: str, seed: int, act: Callable[[int, bool], np.n
         actions.append(action)
         successes.append(info["task_success"])
         rewards.append(info["task_reward"])
-        states.append(scene_env.scene.get_state())
-    return TaskEpisode(task, seed, *map(np.stack, (observations, actions, successes, rewards, states)))
+        states.append(scene_env.get_state())
+        scene_states.append(scene_env.scene.get_state())
+    steps = (observations, actions, successes, rewards, states, scene_states)
+    return TaskEpisode(task, seed, *map(np.stack, steps))
 
 
 def episode_writer(
@@ -99,7 +111,8 @@ def episode_writer(
 ) -> DatasetWriter:
     """
     A step's `success` is that of the attempted task, which is the episode's `source`; the file holds no `rewards`, since those
-    of five tasks would be mixed in it. Extras: `task_success`, `task_reward` and `scene_state` of `TaskEpisode`.
+    of five tasks would be mixed in it. Extras: those of `TaskEpisode`; `state` among
+    them, so that files of frames hold it too.
 
     :param path: of the file
     :param obs_type: "state" or "pixels"
@@ -119,7 +132,7 @@ def episode_writer(
         provenance=provenance,
         mode=mode,
         rewards=False,
-        extras={"task_success": ((5,), "bool"), "task_reward": ((5,), "float32"), "scene_state": ((30,), "float64")},
+        extras=_EXTRAS,
         sources=list(tasks),
         capacity=(n_episodes, n_episodes * env.unwrapped.episode_length),  # type: ignore[attr-defined]
     )
@@ -134,11 +147,7 @@ def add_episode(writer: DatasetWriter, episode: TaskEpisode) -> None:
         episode.observations,
         episode.actions,
         success=episode.success,
-        extras={
-            "task_success": episode.task_success,
-            "task_reward": episode.task_reward,
-            "scene_state": episode.scene_state,
-        },
+        extras={name: getattr(episode, name) for name in _EXTRAS},
         seed=episode.seed,
         source=episode.task,
     )

@@ -13,6 +13,7 @@ import functools
 import shutil
 import subprocess
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +142,9 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
     slice_seed = int(np.random.SeedSequence((seed, index, step)).generate_state(1)[0] >> 1)
     if curve:
         state = folder / f"state_{step}"
-        model = SAC.load(state / "model.zip", env=env, device="cpu")
+        with warnings.catch_warnings():  # SB3 fears for the n-step returns of the buffer that it makes: the next line replaces it
+            warnings.filterwarnings("ignore", message="`n_steps=")
+            model = SAC.load(state / "model.zip", env=env, device="cpu")
         model.load_replay_buffer(state / "replay_buffer.pkl")
         model.set_random_seed(slice_seed)
     else:
