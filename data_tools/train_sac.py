@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
-    parser.add_argument("--settings", choices=list(SETTINGS), default="explore")
+    parser.add_argument("--settings", choices=list(SETTINGS), default="n_step")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--eval-freq", type=int, default=5_000, help="decisions of a slice: whole episodes of 50 (default: 5000)"

@@ -33,7 +33,7 @@ def _train(folder, n_timesteps, *options):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setitem(train_sac.SETTINGS, "explore", {**SMALL, "policy_kwargs": {"net_arch": [8, 6]}})
+    monkeypatch.setitem(train_sac.SETTINGS, "n_step", {**SMALL, "policy_kwargs": {"net_arch": [8, 6]}})
 
 
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, capsys):
