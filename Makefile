@@ -15,7 +15,8 @@ demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (about 
 	$(BIN)/sb3-offline demo --obs-type pixels --output demo-pixels
 
 states-table: $(READY)  ## all methods on all tasks from states, three seeds, into results/ceborl_states.csv (hours)
-	$(BIN)/python benchmarks/states_table.py
+	$(BIN)/python benchmarks/scripted_data.py
+	$(BIN)/sb3-offline benchmark ceborl_states --runs runs/states_table --output results/ceborl_states.csv
 
 test: $(READY)  ## all fast tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile

@@ -5,7 +5,7 @@ One change at a time from CEBORL's defaults, on state observations: what each pa
 
 collects data and examples where they are missing, trains every variant (finished ones are kept, so it can be stopped and
 started again) and writes results/ablation.csv, one row a checkpoint, and docs/images/ablation.png. The protocol stands in
-benchmarks/cells.py. Nothing is chosen by its score.
+sb3_offline/benchmark/grid.py. Nothing is chosen by its score.
 """
 
 import argparse
@@ -13,13 +13,18 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from cells import ENV_ID, ROOT, add_arguments, cell_run, prepare_data, train_cells, write_rows
+from scripted_data import TASKS, add_arguments, prepare_data
 
+from sb3_offline.benchmark.grid import Grid, Method
+from sb3_offline.benchmark.runner import run_grid
+from sb3_offline.benchmark.table import write_table
 from sb3_offline.ceborl import PAPER_FORM
-from sb3_offline.experiment.config import load_config
+from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.experiment.evaluation import success_interval
 
-#: What is changed, by what it belongs to; a variant's folder is named by its place in its group.
+ROOT = Path(__file__).resolve().parent.parent
+
+#: What is changed, by what it belongs to.
 GROUPS: dict[str, dict[str, dict[str, Any]]] = {
     "default": {"default": {}},
     "penalty (a)": {
@@ -64,37 +69,47 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
 VARIANTS = {name: change for group in GROUPS.values() for name, change in group.items()}
 
 
+FIELDS = ("group", "variant", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser, "runs/ablation", "ablation.csv", ["door-open", "plate-slide"], [0])
+    add_arguments(parser)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["door-open", "plate-slide"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
+    parser.add_argument("--runs", type=Path, default=Path("runs/ablation"))
+    parser.add_argument("--output", type=Path, default=ROOT / "results/ablation.csv")
     parser.add_argument("--figure", type=Path, default=ROOT / "docs/images/ablation.png")
+    parser.add_argument("--no-training", action="store_true", help="write the table of the runs that are finished")
     args = parser.parse_args()
 
     prepare_data(args)
-    cells = []
-    for seed, name, task in ((seed, name, task) for seed in args.seeds for name in args.variants for task in args.tasks):
-        run = cell_run(args, "ceborl", changed(load_config("ceborl", ENV_ID), VARIANTS[name]), folder_name(name), task, seed)
-        group = next(group for group, members in GROUPS.items() if name in members)
-        change = ", ".join(f"{key}={value}" for key, value in VARIANTS[name].items())
-        cells.append(({"group": group, "variant": name, "task": task, "seed": seed, "config": change}, run))
-    if not args.no_training:
-        train_cells([run for _, run in cells], args.workers)
-    write_rows(args.output, cells)
+    grid = Grid(
+        env=ENV_ID,
+        methods={name: Method("ceborl", "ceborl", VARIANTS[name]) for name in args.variants},
+        tasks=args.tasks,
+        seeds=args.seeds,
+        n_timesteps=3000,
+        dataset=str(args.data),
+        examples=str(args.examples_dir / "state-{task}.h5"),
+    )
+    for line in run_grid(grid, args.runs, args.output, 0 if args.no_training else args.workers, write_variants):
+        print(line, flush=True)
     plot(args.output, args.figure)
 
 
-def folder_name(variant: str) -> str:
-    """:return: the variant's name without what folders should not have"""
-    return "".join(letter if letter.isalnum() or letter == "." else "-" for letter in variant)
+def write_variants(path: Path, rows: list[dict[str, Any]]) -> None:
+    """
+    :param path: of the CSV file
+    :param rows: of a grid whose methods are variants
+    """
+    groups = {name: group for group, members in GROUPS.items() for name in members}
+    write_table(path, [{"group": groups[row["method"]], **_renamed(row)} for row in rows], FIELDS)
 
 
-def changed(config: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """:return: the config with the change in it, where dicts are joined"""
-    return {
-        **config,
-        **{key: changed(config.get(key, {}), new) if isinstance(new, dict) else new for key, new in change.items()},
-    }
+def _renamed(row: dict[str, Any]) -> dict[str, Any]:
+    return {"variant" if name == "method" else name: value for name, value in row.items()}
 
 
 def plot(table: Path, figure: Path) -> None:

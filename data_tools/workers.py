@@ -26,7 +26,7 @@ def map_in_order(function: Callable[[Job], Result], jobs: Iterable[Job], n_worke
         yield from map(function, jobs)
         return
     waiting: deque[Future[Result]] = deque()
-    pool = ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare_worker)
+    pool = ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
     try:
         for job in jobs:
             waiting.append(pool.submit(function, job))
@@ -38,7 +38,8 @@ def map_in_order(function: Callable[[Job], Result], jobs: Iterable[Job], n_worke
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare_worker() -> None:
+def prepare_worker() -> None:
+    """Keep this process to one thread of each library that it has not loaded yet, and end it when its parent is gone."""
     # Software rendering and BLAS each start a thread for every core otherwise.
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     threading.Thread(target=_follow_parent, daemon=True).start()

@@ -1,6 +1,7 @@
 """The command ``sb3-offline``: parse, call the library, print."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -53,6 +54,7 @@ def _parser(chosen: list[str]) -> argparse.ArgumentParser:
     add("convert", "compress a dataset, lay it out raw, or take over another library's", _tool("convert_dataset"))
     add("train", "train one policy", _train)
     add("evaluate", "play a trained policy", _evaluate)
+    add("benchmark", "train and evaluate a grid of methods, tasks and seeds", _benchmark)
     add("demo", "collect, train, evaluate and report, all by itself", _demo)
     return parser
 
@@ -159,6 +161,30 @@ def _evaluate(parser: argparse.ArgumentParser) -> Callable:
 
             record_gif(model, run_config["env"], run_config["env_kwargs"], args.gif, seed=args.seed)
             print(f"Saved {args.gif}")
+
+    return run
+
+
+def _benchmark(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("grid", help="a YAML file, or a shipped grid's name, e.g. table1_states")
+    parser.add_argument(
+        "--runs", type=Path, required=True, help="folder of the runs; what is finished or saved there is taken up"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="CSV file, written anew after every run")
+    parser.add_argument("--workers", type=int, help="runs at once, one thread each (default: as many as there are cores)")
+    parser.add_argument("--methods", nargs="+", help="some of the grid's only")
+    parser.add_argument("--tasks", nargs="+", help="likewise")
+    parser.add_argument("--seeds", nargs="+", type=int, help="likewise")
+    parser.add_argument("--no-training", action="store_true", help="write the table of what is finished")
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.benchmark.grid import load_grid
+        from sb3_offline.benchmark.runner import run_grid
+
+        grid = load_grid(args.grid).part(args.methods, args.tasks, args.seeds)
+        n_workers = 0 if args.no_training else args.workers or os.cpu_count() or 1
+        for line in run_grid(grid, args.runs, args.output, n_workers):
+            print(line, flush=True)
 
     return run
 

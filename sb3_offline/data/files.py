@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -45,6 +47,26 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def lock_file(file: Any, path: Path) -> None:
+    """
+    Refuse a second writer: two would write over each other's work. The lock goes with the process, also when killed.
+
+    :param file: open; closing it frees the lock
+    :param path: for the ``DatasetError`` that is raised where another process holds it
+    """
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        remedy = "Wait until it is done, or write to another file"
+        raise DatasetError(path, "file", "is being written by another process", remedy) from error
+    except OSError:  # some network file systems have no locks
+        pass
 
 
 def open_hdf5(path: str | os.PathLike) -> h5py.File:

@@ -1,7 +1,6 @@
 """A writer that commits whole episodes: a process killed at any moment leaves a file that opens and holds them all."""
 
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.files import open_hdf5, replacing, temporary_path
+from sb3_offline.data.files import lock_file, open_hdf5, replacing, temporary_path
 from sb3_offline.data.format import Header, create_file, read_header
 from sb3_offline.data.spaces import check_observations, check_rows, to_array
 
@@ -219,7 +218,7 @@ class DatasetWriter:
         """Open the file at its path for writing, as the only writer."""
         self._release()
         self._file = open(self.path, "r+b", buffering=0)
-        _lock(self._file, self.path)
+        lock_file(self._file, self.path)
 
     def _read_places(self, file: h5py.File) -> None:
         self._offsets = {name: file[name].id.get_offset() for name in [*self._fields, "n_episodes"]}
@@ -287,18 +286,3 @@ def _copy(source: Any, source_offset: int, target: Any, target_offset: int, size
 def _write_all(file: Any, data: memoryview) -> None:
     while data:  # the system may write less than asked for (Linux: at most 2 GiB at once)
         data = data[file.write(data) :]
-
-
-def _lock(file: Any, path: Path) -> None:
-    """Refuse a second writer: two would write over each other's rows. The lock goes with the process, also when killed."""
-    if sys.platform == "win32":
-        return
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        remedy = "Wait until it is done, or write to another file"
-        raise DatasetError(path, "file", "is being written by another process", remedy) from error
-    except OSError:  # some network file systems have no locks
-        pass

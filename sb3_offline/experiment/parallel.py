@@ -36,7 +36,7 @@ def _run(label: str, arguments: dict[str, Any], reports: Any) -> None:
     th.set_num_threads(1)
     from sb3_offline.experiment.training import train
 
-    train(**arguments, progress_bar=False, callback=_ReportProgress(reports, label))
+    train(**arguments, progress_bar=False, callbacks=[_ReportProgress(reports, label)])
 
 
 def train_in_parallel(

@@ -1,31 +1,34 @@
 """One training run: a config, a dataset and examples become checkpoints and a table of evaluations."""
 
 import csv
-import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_offline
 from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.data.files import replacing
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.selection import select_episodes
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success
 
 EVALUATION_FIELDS = ("step", "episodes", "successes", "mean_return")
+RESUME_FILE = "resume.zip"
 
 
 class EvaluationTable(BaseCallback):
     """
-    Evaluates at regular steps and appends a row to a CSV file each time.
+    Evaluates at regular steps and keeps a CSV file with a row for each. Where a saved model goes on learning, rows up to its
+    step stay, so that the model and the table never disagree.
 
-    :param path: of the CSV file, written anew
+    :param path: of the CSV file
     :param env_id: registered id
     :param env_kwargs: of the environment
     :param eval_freq: gradient steps between evaluations
@@ -43,27 +46,80 @@ class EvaluationTable(BaseCallback):
         eval_freq: int,
         n_episodes: int,
         eval_start: int = 0,
-        seeds: Iterable[int] | None = None,
+        seeds: Sequence[int] | None = None,
         verbose: int = 0,
     ):
         super().__init__(verbose)
         self.path, self.env_id, self.env_kwargs = path, env_id, env_kwargs
-        self.eval_freq, self.n_episodes, self.eval_start = eval_freq, n_episodes, eval_start
-        self.seeds = iter(seeds or itertools.repeat(EVALUATION_SEED))
+        self.eval_freq, self.n_episodes, self.eval_start, self.seeds = eval_freq, n_episodes, eval_start, seeds
+
+    def rows(self, until: int) -> list[dict[str, str]]:
+        """
+        :param until: last step to look at
+        :return: what the file holds up to there, by :data:`EVALUATION_FIELDS`
+        """
+        if not self.path.is_file():
+            return []
+        with self.path.open(newline="") as file:
+            return [row for row in csv.DictReader(file) if int(row["step"]) <= until]
+
+    def steps(self, until: int) -> list[int]:
+        """
+        :param until: last step to look at
+        :return: steps up to there at which there are evaluations
+        """
+        return [step for step in range(self.eval_freq, until + 1, self.eval_freq) if step >= self.eval_start]
+
+    def is_complete(self, until: int) -> bool:
+        """
+        :param until: last step to look at
+        :return: whether the file holds all evaluations up to there
+        """
+        found = [(int(row["step"]), int(row["episodes"])) for row in self.rows(until)]
+        return found == [(step, self.n_episodes) for step in self.steps(until)]
 
     def _on_training_start(self) -> None:
-        with self.path.open("w", newline="") as file:
-            csv.writer(file).writerow(EVALUATION_FIELDS)
+        self._write(self.rows(self.num_timesteps))
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.eval_freq == 0 and self.num_timesteps >= self.eval_start:
-            result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes, next(self.seeds))
-            with self.path.open("a", newline="") as file:
-                csv.writer(file).writerow(evaluation_row(self.num_timesteps, result))
+            rows = self.rows(self.num_timesteps - 1)
+            seed = EVALUATION_SEED if self.seeds is None else self.seeds[len(rows)]
+            result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes, seed)
+            values = map(str, evaluation_row(self.num_timesteps, result))
+            self._write([*rows, dict(zip(EVALUATION_FIELDS, values, strict=True))])
             self.logger.record("eval/success_rate", result.success_rate)
             if self.verbose:
                 print(f"step {self.num_timesteps}: {sum(result.successes)} of {self.n_episodes} episodes solved")
         return True
+
+    def _write(self, rows: list[dict[str, str]]) -> None:
+        with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, EVALUATION_FIELDS)
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+class _SaveForResume(BaseCallback):
+    """Saves all that a killed run needs to go on. The last callback: what others wrote at this step is on the disk before."""
+
+    def __init__(self, path: Path, save_freq: int):
+        super().__init__()
+        self.path, self.save_freq = path, save_freq
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.save_freq == 0 and self.num_timesteps < self.model._total_timesteps:
+            save_whole(self.model, self.path)
+        return True
+
+
+def save_whole(model: BaseAlgorithm, path: Path) -> None:
+    """
+    :param model: is saved, so that no kill leaves half a file
+    :param path: of the zip file
+    """
+    with replacing(path) as temporary:
+        model.save(temporary)
 
 
 def evaluation_row(step: int, result: Evaluation) -> tuple[int, int, int, float]:
@@ -104,15 +160,18 @@ def create_model(
     :return: a model, not trained
     """
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
-    if "episodes" in config:
-        dataset = choose_data(dataset, config["episodes"], config.get("env_kwargs", {}))
-    arguments.update(dataset=dataset, seed=seed, **kwargs)
-    if examples is not None:
-        arguments["examples"] = examples
+    arguments.update(**_data_arguments(config, dataset, examples), seed=seed, **kwargs)
     try:
         return find_algorithm(algo)(env=None, **arguments)  # type: ignore[arg-type]
     except TypeError as error:
         raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams and --examples") from error
+
+
+def _data_arguments(config: dict[str, Any], dataset: Any, examples: Any) -> dict[str, Any]:
+    """:return: arguments of a model's constructor, and of ``load``, that say what it learns from"""
+    if "episodes" in config:
+        dataset = choose_data(dataset, config["episodes"], config.get("env_kwargs", {}))
+    return {"dataset": dataset} if examples is None else {"dataset": dataset, "examples": examples}
 
 
 def choose_data(dataset: Any, episodes: dict[str, Any], env_kwargs: dict[str, Any]) -> list[OfflineDataset]:
@@ -148,10 +207,9 @@ def train(
     seed: int = 0,
     eval_freq: int = 0,
     n_eval_episodes: int = 20,
-    eval_start: int = 0,
-    eval_seeds: Iterable[int] | None = None,
+    save_freq: int = 0,
     progress_bar: bool = True,
-    callback: BaseCallback | None = None,
+    callbacks: Sequence[BaseCallback] = (),
     verbose: int = 0,
 ) -> OfflineAlgorithm:
     """
@@ -167,34 +225,44 @@ def train(
     :param seed: of the run
     :param eval_freq: gradient steps between evaluations (0: none)
     :param n_eval_episodes: episodes of each evaluation
-    :param eval_start: no evaluation at an earlier step
-    :param eval_seeds: of the evaluations' episodes, one after the other (default: all play the same episodes)
+    :param save_freq: gradient steps between two saves of all that the run needs to go on (0: none). A run that was killed
+        goes on from the last one when it is started again with the same arguments, and ends as if it had never stopped.
     :param progress_bar: whether to show one
-    :param callback: one more callback
+    :param callbacks: more callbacks; an :class:`EvaluationTable` among them goes on with the run
     :param verbose: 1 for info messages
     :return: the trained model
     """
     record = run_record(algo, env_id, config, dataset=dataset, examples=examples, env_kwargs=env_kwargs, seed=seed)
+    config = {**config, "env_kwargs": record["env_kwargs"]}
+    all_callbacks = list(callbacks)
     if eval_freq:
         try:
             gym.spec(env_id)
         except gym.error.Error as error:
             raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
-    output.mkdir(parents=True, exist_ok=True)
-    all_env_kwargs = record["env_kwargs"]
-    model = create_model(algo, {**config, "env_kwargs": all_env_kwargs}, dataset, examples, seed, verbose=verbose)
-    (output / "model.zip").unlink(missing_ok=True)  # of an earlier run: this one is finished when its own is there
-    (output / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
-    callbacks = [callback] if callback is not None else []
-    if isinstance(model, CEBORL):
-        callbacks.append(DiagnosticsCallback())
-    if eval_freq:
         table = output / "evaluations.csv"
-        callbacks.append(
-            EvaluationTable(table, env_id, all_env_kwargs, eval_freq, n_eval_episodes, eval_start, eval_seeds, verbose)
-        )
-    model.learn(config["n_timesteps"], callback=callbacks, progress_bar=progress_bar)
-    model.save(output / "model.zip")
+        all_callbacks.append(EvaluationTable(table, env_id, config["env_kwargs"], eval_freq, n_eval_episodes, verbose=verbose))
+    resume_file, model = output / RESUME_FILE, None
+    if save_freq and resume_file.is_file() and recorded_run(output) == record:
+        model = find_algorithm(algo).load(resume_file, **_data_arguments(config, dataset, examples))
+        tables = [callback for callback in all_callbacks if isinstance(callback, EvaluationTable)]
+        if not all(table.is_complete(model.num_timesteps) for table in tables):
+            model = None  # other evaluations were asked for than that run made
+    if model is None:
+        model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
+        for stale in ("model.zip", RESUME_FILE):  # of an earlier run: this one is finished when its own model is there
+            (output / stale).unlink(missing_ok=True)
+        with replacing(output / "config.yml") as temporary:
+            temporary.write_text(yaml.safe_dump(record, sort_keys=False))
+    if isinstance(model, CEBORL):
+        all_callbacks.append(DiagnosticsCallback())
+    if save_freq:
+        all_callbacks.append(_SaveForResume(resume_file, save_freq))
+    n_timesteps = config["n_timesteps"] - model.num_timesteps
+    is_new = model.num_timesteps == 0
+    model.learn(n_timesteps, callback=all_callbacks, reset_num_timesteps=is_new, progress_bar=progress_bar)
+    save_whole(model, output / "model.zip")
+    resume_file.unlink(missing_ok=True)
     return model
 
 
@@ -224,10 +292,16 @@ def is_finished(output: Path, arguments: dict[str, Any]) -> bool:
     :param arguments: of :func:`train`
     :return: whether a run with these arguments is complete there
     """
+    return (output / "model.zip").is_file() and recorded_run(output) == run_record(**arguments)
+
+
+def recorded_run(output: Path) -> dict[str, Any] | None:
+    """
+    :param output: folder of a run
+    :return: what :func:`train` wrote into its ``config.yml``
+    """
     config_file = output / "config.yml"
-    if not (output / "model.zip").is_file() or not config_file.is_file():
-        return False
-    return yaml.safe_load(config_file.read_text()) == run_record(**arguments)
+    return yaml.safe_load(config_file.read_text()) if config_file.is_file() else None
 
 
 def load_run(model_path: Path) -> tuple[OfflineAlgorithm, dict[str, Any]]:

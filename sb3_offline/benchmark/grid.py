@@ -1,0 +1,262 @@
+"""What is trained and how it is counted: one YAML file."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_offline.common.example_based import ExampleBasedAlgorithm
+from sb3_offline.experiment.config import config_path, load_config
+from sb3_offline.experiment.evaluation import EVALUATION_SEED
+from sb3_offline.experiment.training import EvaluationTable, find_algorithm, is_finished, run_record
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A row of the table.
+
+    :param algo: name in :data:`sb3_offline.ALGOS`
+    :param config: a shipped config's name or a YAML file
+    :param changes: what is changed in it; dicts are joined
+    """
+
+    algo: str
+    config: str
+    changes: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return " ".join([self.config, *(f"{key}={value}" for key, value in self.changes.items())])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    A table of methods, tasks and seeds, and its protocol, which is fixed before any run: a cell counts by its last
+    ``checkpoints`` checkpoints, evenly spaced over the last half of its gradient steps (five: at 60, 70, 80, 90 and 100 %),
+    with ``episodes`` episodes each. These are other ones at each checkpoint and for each seed, but the same for all cells of
+    a seed. No checkpoint is chosen.
+
+    :param env: id of the environment
+    :param methods: name of the row to what it is
+    :param tasks: each becomes the environment's keyword argument ``task``
+    :param seeds: of the runs
+    :param n_timesteps: gradient steps, the same for every method
+    :param dataset: path, pattern, or a list of these; ``{task}`` in it stands for the task
+    :param examples: path of the success examples, likewise; for the methods that learn from them
+    :param env_kwargs: of the environment, beside the configs'
+    :param save_freq: gradient steps between two saves, which a killed run goes on from
+    :param checkpoints: that count
+    :param episodes: of each
+    """
+
+    env: str
+    methods: dict[str, Method]
+    tasks: list[str]
+    seeds: list[int]
+    n_timesteps: int
+    dataset: str | list[str]
+    examples: str | None = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    save_freq: int = 500
+    checkpoints: int = 5
+    episodes: int = 10
+
+    def __post_init__(self) -> None:
+        if self.n_timesteps % (2 * self.checkpoints) or self.n_timesteps <= 0:
+            raise RuntimeError(
+                f"n_timesteps is {self.n_timesteps}, but {self.checkpoints} checkpoints evenly spaced over the last half "
+                f"need a multiple of {2 * self.checkpoints}"
+            )
+
+    def part(
+        self, methods: Iterable[str] | None = None, tasks: Iterable[str] | None = None, seeds: Iterable[int] | None = None
+    ) -> "Grid":
+        """
+        :param methods: to keep (default: all)
+        :param tasks: likewise
+        :param seeds: likewise
+        :return: the grid of these alone
+        """
+        chosen: dict[str, Any] = {"methods": methods, "tasks": tasks, "seeds": seeds}
+        for name, wanted in chosen.items():
+            own = list(getattr(self, name))
+            chosen[name] = own if wanted is None else list(wanted)
+            unknown = [part for part in chosen[name] if part not in own]
+            if unknown:
+                raise RuntimeError(f"The grid's {name} are {', '.join(map(str, own))}; it has no {unknown[0]}")
+        chosen["methods"] = {name: self.methods[name] for name in chosen["methods"]}
+        return replace(self, **chosen)
+
+    def evaluation_steps(self) -> list[int]:
+        """:return: steps of the checkpoints that count"""
+        spacing = self.n_timesteps // (2 * self.checkpoints)
+        return [spacing * (self.checkpoints + 1 + index) for index in range(self.checkpoints)]
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One training. It fills one cell of the table; or one of each task, where nothing that is learned from depends on the task:
+    trained once, its policies are evaluated on all of them, by the same protocol and with the same outcome as if it had been
+    trained once for each.
+
+    :param label: method, tasks and seed in words
+    :param folder: of its files
+    :param tasks: that it is evaluated on
+    :param arguments: of :func:`~sb3_offline.experiment.training.train`
+    :param grid: that it is of
+    """
+
+    label: str
+    folder: Path
+    tasks: tuple[str, ...]
+    arguments: dict[str, Any]
+    grid: Grid
+
+    def tables(self) -> list[EvaluationTable]:
+        """:return: of each task, the callback that evaluates the run's policy"""
+        return [self.table(task) for task in self.tasks]
+
+    def table(self, task: str) -> EvaluationTable:
+        """
+        :param task: one of the run's
+        :return: the callback that evaluates the run's policy on it
+        """
+        grid, config = self.grid, self.arguments["config"]
+        steps, first_seed = grid.evaluation_steps(), EVALUATION_SEED + 1000 * (1 + self.arguments["seed"])
+        return EvaluationTable(
+            self.folder / f"evaluations-{task}.csv",
+            grid.env,
+            {**config.get("env_kwargs", {}), "task": task},
+            eval_freq=grid.n_timesteps // (2 * grid.checkpoints),
+            n_episodes=grid.episodes,
+            eval_start=steps[0],
+            seeds=range(first_seed, first_seed + grid.checkpoints),
+        )
+
+    def record(self) -> dict[str, Any]:
+        """:return: what ``config.yml`` in the folder says when it was trained with these arguments"""
+        return run_record(**self.arguments)
+
+    def is_finished(self) -> bool:
+        """:return: whether it was trained and evaluated to the end"""
+        whole = all(table.is_complete(self.grid.n_timesteps) for table in self.tables())
+        return whole and is_finished(self.folder, self.arguments)
+
+
+def load_grid(name: str) -> Grid:
+    """
+    :param name: a YAML file, or a shipped grid's name (``"table1_states"``)
+    :return: what it holds
+    """
+    path = config_path(name if Path(name).suffix else f"grids/{name}")
+    if not path.is_file():
+        shipped = sorted(file.stem for file in config_path("grids/any").parent.glob("*.yml"))
+        raise RuntimeError(f"{path}: there is no such grid; give a path, or one of {', '.join(shipped)}")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+    content = _checked(content, Grid, f"{path}")
+    for key, kind in (("methods", Mapping), ("env_kwargs", Mapping), ("tasks", list), ("seeds", list)):
+        if key in content and not (isinstance(content[key], kind) and (content[key] or key == "env_kwargs")):
+            raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a {'list' if kind is list else 'section'}")
+    for key in ("n_timesteps", "save_freq", "checkpoints", "episodes"):
+        if key in content and (not isinstance(content[key], int) or content[key] < 1):
+            raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a whole number of at least 1")
+    methods = {
+        name: Method(**_checked(section, Method, f"{path}: methods: {name}")) for name, section in content["methods"].items()
+    }
+    try:
+        return Grid(**{**content, "methods": methods})
+    except RuntimeError as error:
+        raise RuntimeError(f"{path}: {error}") from error
+
+
+def _checked(section: Any, kind: type, place: str) -> dict[str, Any]:
+    """:return: the section, if its keys are those of the dataclass"""
+    known = {part.name: part.default is MISSING and part.default_factory is MISSING for part in fields(kind)}
+    if not isinstance(section, Mapping):
+        raise RuntimeError(f"{place}: is {section!r}; write a section with {', '.join(known)}")
+    for wrong, what in ((set(section) - set(known), "unknown"), ({k for k in known if known[k]} - set(section), "missing")):
+        if wrong:
+            raise RuntimeError(f"{place}: {', '.join(sorted(map(str, wrong)))}: {what}; the keys are {', '.join(known)}")
+    return dict(section)
+
+
+def plan(grid: Grid, runs: Path) -> dict[tuple[str, str, int], Run]:
+    """
+    :param grid: what is asked for
+    :param runs: folder of all runs
+    :return: method, task and seed of each cell to the run that fills it. Seeds are outermost, so that a grid that was stopped
+        early is one of fewer seeds.
+    """
+    folders = [_folder_name(name) for name in grid.methods]
+    if len({*folders}) < len(folders):
+        raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
+    cells: dict[tuple[str, str, int], Run] = {}
+    shared: dict[tuple[str, int], Run] = {}
+    for seed in grid.seeds:
+        for task in grid.tasks:
+            for name, method in grid.methods.items():
+                if _depends_on_task(grid, method):
+                    run = _run(grid, name, seed, (task,), runs)
+                else:
+                    run = shared.setdefault((name, seed), _run(grid, name, seed, tuple(grid.tasks), runs))
+                cells[name, task, seed] = run
+    return cells
+
+
+def _run(grid: Grid, name: str, seed: int, tasks: tuple[str, ...], runs: Path) -> Run:
+    method, of_task = grid.methods[name], len(tasks) == 1 and _depends_on_task(grid, grid.methods[name])
+    if _takes_examples(method) and grid.examples is None:
+        raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
+    config = merged(load_config(method.config, grid.env), method.changes)
+    config["env_kwargs"] = {**config.get("env_kwargs", {}), **grid.env_kwargs}
+    arguments = {
+        "algo": method.algo,
+        "env_id": grid.env,
+        "config": {**config, "n_timesteps": grid.n_timesteps},
+        "output": runs / _folder_name(name) / (f"{tasks[0]}-seed{seed}" if of_task else f"seed{seed}"),
+        "dataset": _filled(grid.dataset, tasks[0]),
+        "examples": _filled(grid.examples, tasks[0]) if _takes_examples(method) else None,
+        "env_kwargs": {"task": tasks[0]} if of_task else {},
+        "seed": seed,
+    }
+    return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tasks, arguments, grid)
+
+
+def _takes_examples(method: Method) -> bool:
+    return issubclass(find_algorithm(method.algo), ExampleBasedAlgorithm)
+
+
+def _depends_on_task(grid: Grid, method: Method) -> bool:
+    """:return: whether a policy learns from anything that is another one for another task: examples, files, or episodes"""
+    config = merged(load_config(method.config, grid.env), method.changes)
+    texts = [grid.dataset, config.get("episodes"), grid.examples if _takes_examples(method) else None]
+    return any("{task}" in str(text) for text in texts)
+
+
+def _filled(paths: Any, task: str) -> Any:
+    """:return: the path or the paths of a task"""
+    return [_filled(path, task) for path in paths] if isinstance(paths, list) else paths and paths.replace("{task}", task)
+
+
+def _folder_name(name: str) -> str:
+    """:return: a row's name without what folders should not have"""
+    return "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in name)
+
+
+def merged(config: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param config: of an algorithm
+    :param changes: to it
+    :return: the config with the changes in it, where dicts are joined
+    """
+    return {
+        **config,
+        **{key: merged(config.get(key, {}), new) if isinstance(new, dict) else new for key, new in changes.items()},
+    }

@@ -1,0 +1,62 @@
+"""The runs of a grid on this machine: a process each, one thread each, as many at once as there are cores."""
+
+import multiprocessing
+import sys
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from multiprocessing.connection import wait
+from typing import Any
+
+from sb3_offline.benchmark.grid import Run
+from sb3_offline.benchmark.worker import train_run
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data_tools.workers import prepare_worker
+
+#: A run whose process is killed so many times is left for later: it may need more memory than there is.
+MOST_KILLS = 3
+_IN_USE = 75  # the exit code of a process that found another one at its run
+
+
+def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
+    """
+    :param runs: that are not finished, in the order in which to start them
+    :param n_workers: processes
+    :return: each run when it is finished or has failed. A killed process is no failure of its run: another goes on with it.
+        Raises ``RuntimeError`` at the end where runs are left unfinished
+    """
+    context = multiprocessing.get_context("spawn")
+    waiting, left = deque(runs), []
+    working: dict[Any, tuple[Any, Run]] = {}
+    kills: Counter[str] = Counter()
+    try:
+        while waiting or working:
+            while waiting and len(working) < n_workers:
+                run = waiting.popleft()
+                process = context.Process(target=_work, args=(run,))
+                process.start()
+                working[process.sentinel] = process, run
+            for sentinel in wait(list(working)):
+                process, run = working.pop(sentinel)
+                process.join()
+                if process.exitcode == 0:
+                    yield run
+                    continue
+                kills[run.label] += 1
+                if process.exitcode != _IN_USE and kills[run.label] < MOST_KILLS:
+                    waiting.appendleft(run)
+                else:
+                    left.append(f"{run.label} ({'another process is at it' if process.exitcode == _IN_USE else 'killed'})")
+    finally:
+        for process, _ in working.values():
+            process.terminate()
+    if left:
+        raise RuntimeError(f"Left unfinished: {'; '.join(left)}. Start the same command again to go on with them")
+
+
+def _work(run: Run) -> None:
+    prepare_worker()
+    try:
+        train_run(run)
+    except DatasetError as error:
+        print(error, file=sys.stderr)
+        sys.exit(_IN_USE)

@@ -1,0 +1,53 @@
+"""From a grid to its table."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from sb3_offline.benchmark.grid import Grid, Run, plan
+from sb3_offline.benchmark.local import train_locally
+from sb3_offline.benchmark.table import failure_of, table_rows, write_table
+from sb3_offline.data.reader import open_datasets
+
+
+def run_grid(
+    grid: Grid, runs: Path, output: Path, n_workers: int, write: Callable[[Path, list], None] = write_table
+) -> Iterator[str]:
+    """
+    Train what is not finished, and write the table at once and after every run.
+
+    :param grid: what is asked for
+    :param runs: folder of the runs
+    :param output: CSV file
+    :param n_workers: runs at once; 0 trains nothing
+    :param write: gets ``output`` and the rows of :func:`~sb3_offline.benchmark.table.table_rows`
+    :return: what to tell the user, when it happens
+    """
+    cells, began = plan(grid, runs), time.monotonic()
+    trainings = list({run.folder: run for run in cells.values()}.values())
+    unfinished = [run for run in trainings if not run.is_finished()] if n_workers else []
+    _check_files(unfinished)
+    write(output, table_rows(cells))
+    yield f"{len(trainings)} runs fill {len(cells)} cells; {len(unfinished)} are to be trained"
+    for number, run in enumerate(train_locally(unfinished, n_workers), start=1):
+        write(output, table_rows(cells))
+        minutes = (time.monotonic() - began) / 60
+        yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
+
+
+def _check_files(runs: list[Run]) -> None:
+    """A path that is wrong for all of them would make a failure of each."""
+    for dataset in {str(run.arguments["dataset"]): run.arguments["dataset"] for run in runs}.values():
+        open_datasets(dataset)
+    for examples in sorted({run.arguments["examples"] for run in runs if run.arguments["examples"]}):
+        if not Path(examples).exists():
+            raise RuntimeError(f"{examples}: there are no such success examples; make them, or correct `examples:`")
+
+
+def _outcome(run: Run) -> str:
+    failure = failure_of(run)
+    if failure:
+        return f"failed: {failure}"
+    rows = [row for table in run.tables() for row in table.rows(run.grid.n_timesteps)]
+    solved, episodes = (sum(int(row[name]) for row in rows) for name in ("successes", "episodes"))
+    return f"{solved} of {episodes} episodes solved"

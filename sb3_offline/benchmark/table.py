@@ -1,0 +1,58 @@
+"""The CSV file of a grid: a row for each checkpoint that counts."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_offline.benchmark.grid import Run
+from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
+from sb3_offline.data.files import replacing
+from sb3_offline.experiment.training import recorded_run
+
+FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
+
+
+def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]]:
+    """
+    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
+    :return: rows of :data:`FIELDS` of the cells that are finished or have failed. In a failed one the checkpoints that it
+        never reached count as so many failures, and ``config`` says what went wrong.
+    """
+    rows = []
+    for (method, task, seed), run in cells.items():
+        failure = failure_of(run)
+        if not (failure or run.is_finished()):
+            continue
+        grid = run.grid
+        reached = run.table(task).rows(grid.n_timesteps) if recorded_run(run.folder) == run.record() else []
+        found = {int(row["step"]): row for row in reached}
+        provenance = run.folder / PROVENANCE_FILE
+        missing: dict[str, Any] = {"episodes": grid.episodes, "successes": 0}
+        for step in grid.evaluation_steps():
+            row = {"method": method, "task": task, "seed": seed, "step": step}
+            row |= {name: int(found.get(step, missing)[name]) for name in missing}
+            row["config"] = f"{grid.methods[method]}" + (f" (failed: {failure})" if failure else "")
+            row |= json.loads(provenance.read_text()) if provenance.is_file() else {"commit": "", "versions": ""}
+            rows.append(row)
+    return rows
+
+
+def failure_of(run: Run) -> str | None:
+    """:return: what went wrong in a run, if it did"""
+    file = run.folder / FAILURE_FILE
+    failure = json.loads(file.read_text()) if file.is_file() else {}
+    return failure["error"] if failure.get("run") == run.record() else None
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], fields: Sequence[str] = FIELDS) -> None:
+    """
+    :param path: of the CSV file, which a reader finds whole at any time
+    :param rows: of :func:`table_rows`
+    :param fields: columns
+    """
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fields)
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,95 @@
+"""One run of a grid, in a process of its own: on this machine or on a cluster."""
+
+import importlib.metadata
+import json
+import os
+import subprocess
+import traceback
+from pathlib import Path
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+import sb3_offline
+from sb3_offline.benchmark.grid import Run
+from sb3_offline.data.files import lock_file, replacing
+from sb3_offline.experiment.training import train
+
+FAILURE_FILE, PROVENANCE_FILE, LOCK_FILE = "failure.json", "provenance.json", "lock"
+THEN = " then "
+_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "metaworld", "mujoco")
+
+
+def train_run(run: Run) -> None:
+    """
+    Train a run of a grid, or go on with it, unless it is finished. What goes wrong in it is written down in its folder; a run
+    that failed before is tried again, from its last save on.
+
+    :param run: what to do; raises ``DatasetError`` where another process is at it
+    """
+    th.set_num_threads(1)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with (run.folder / LOCK_FILE).open("a") as lock:
+        lock_file(lock, run.folder)
+        lock.truncate(0)
+        lock.write(f"{os.getpid()}")  # for whoever wonders what is at it
+        lock.flush()
+        if run.is_finished():
+            return
+        try:
+            callbacks = [_Provenance(run.folder / PROVENANCE_FILE), *run.tables()]
+            train(**run.arguments, callbacks=callbacks, save_freq=run.grid.save_freq, progress_bar=False)
+        except Exception as error:
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            failure = {"error": text, "run": run.record(), "traceback": traceback.format_exc()}
+            with replacing(run.folder / FAILURE_FILE) as temporary:
+                temporary.write_text(json.dumps(failure, indent=1))
+        else:
+            (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+
+
+class _Provenance(BaseCallback):
+    """Leaves beside a run which code made it: of each commit, where a run went on with another one."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path = path
+
+    def _on_training_start(self) -> None:
+        now = {"commit": current_commit(), "versions": versions()}
+        before = json.loads(self.path.read_text()) if self.num_timesteps and self.path.is_file() else {}
+        for name, earlier in before.items():
+            is_same = earlier.split(THEN)[-1] == now[name]
+            now[name] = earlier if is_same else earlier + THEN + now[name]
+        with replacing(self.path) as temporary:
+            temporary.write_text(json.dumps(now))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def current_commit() -> str:
+    """:return: the commit that the code is of, with a + where the code differs from it; "unknown" outside of a repository"""
+    root = Path(sb3_offline.__file__).parent.parent
+    code = ["sb3_offline", "zoo_configs", "data_tools"]
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        if not git("ls-files", "sb3_offline/version.txt"):
+            return "unknown"  # the repository is of something else, in which this package is installed
+        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(git("status", "--porcelain", *code))
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def versions() -> str:
+    """:return: of the packages that decide what comes out"""
+    installed = []
+    for name in _PACKAGES:
+        try:
+            installed.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return ", ".join(installed)

@@ -1,0 +1,167 @@
+"""A grid of runs: whatever is killed, its table is that of a grid that was not."""
+
+import csv
+import os
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch as th
+import yaml
+
+pytest.importorskip("metaworld")
+
+from sb3_offline import cli
+from sb3_offline.benchmark.grid import load_grid, plan
+from sb3_offline.benchmark.local import train_locally
+from sb3_offline.benchmark.table import table_rows
+from sb3_offline.benchmark.worker import LOCK_FILE, train_run
+from sb3_offline.data.examples import save_examples
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data_tools.collect_scripted import collect_scripted
+from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.experiment.training import RESUME_FILE, load_run
+
+TABLE = "evaluations-door-open.csv"
+GRID = {
+    "env": "MultimodalMetaworld-v0",
+    "tasks": ["door-open", "drawer-open"],
+    "seeds": [3],
+    "n_timesteps": 40,
+    "save_freq": 5,
+    "checkpoints": 2,
+    "episodes": 1,
+    "methods": {
+        "ceborl": {"algo": "ceborl", "config": "ceborl", "changes": {"batch_size": 16}},
+        "cql": {"algo": "cql", "config": "cql", "changes": {"batch_size": 16}},
+        "bc": {"algo": "bc", "config": "bc"},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    collect_scripted(folder / "data.h5", episodes_per_task=8, tasks=GRID["tasks"], n_workers=1)
+    dataset = OfflineDataset(folder / "data.h5")
+    for task in GRID["tasks"]:
+        examples, provenance = extract_examples(folder / "data.h5", 5, source=task)
+        save_examples(folder / f"{task}.h5", examples, dataset.observation_space, provenance)
+    return {"dataset": str(folder / "data.h5"), "examples": str(folder / "{task}.h5")}
+
+
+def write_grid(folder, data, **changes):
+    (folder / "grid.yml").write_text(yaml.safe_dump({**GRID, **data, **changes}))
+    return str(folder / "grid.yml")
+
+
+def run_benchmark(folder, grid, *options):
+    cli.main(["benchmark", grid, "--runs", str(folder / "runs"), "-o", str(folder / "table.csv"), "--workers", "1", *options])
+    with (folder / "table.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def kill_once(run, file, n_lines, done):
+    """Kill the process of a run as soon as a file of it has so many lines."""
+    while not done.is_set():
+        path = run.folder / file
+        if path.exists() and path.read_bytes().count(b"\n") >= n_lines:
+            os.kill(int((run.folder / LOCK_FILE).read_text()), signal.SIGKILL)
+            return
+        time.sleep(0.002)
+    raise AssertionError(f"{run.label} was not killed")
+
+
+def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
+    grid = load_grid(write_grid(tmp_path, data, n_timesteps=200)).part(["ceborl", "cql"], ["door-open"])
+    whole, killed = (plan(grid, tmp_path / name) for name in ("whole", "killed"))
+    for run in whole.values():
+        train_run(run)
+    ceborl, cql = killed.values()
+    done = threading.Event()
+    with ThreadPoolExecutor() as pool:
+        # One after its first save, the other after its first evaluation, perhaps before it saved that step
+        kills = [pool.submit(kill_once, ceborl, RESUME_FILE, 0, done), pool.submit(kill_once, cql, TABLE, 2, done)]
+        assert len(list(train_locally([ceborl, cql], n_workers=2))) == 2
+        done.set()
+        for kill in kills:
+            kill.result()
+    assert table_rows(killed) == table_rows(whole) and len(table_rows(whole)) == 4
+    for one, other in zip(killed.values(), whole.values(), strict=True):
+        assert_same(*(load_run(run.folder / "model.zip")[0].get_parameters() for run in (one, other)))
+        assert [file.name for file in sorted(one.folder.iterdir())] == [file.name for file in sorted(other.folder.iterdir())]
+
+
+def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
+    methods = {"wrong": {"algo": "bc", "config": "bc", "changes": {"batch_size": "many"}}, **GRID["methods"]}
+    grid = write_grid(tmp_path, data, methods=methods)
+    options = ["--methods", "wrong", "bc", "ceborl", "--tasks", "door-open"]
+    rows = run_benchmark(tmp_path, grid, *options)
+    assert [(row["method"], row["step"], row["episodes"]) for row in rows] == [
+        (name, step, "1") for name in ("wrong", "bc", "ceborl") for step in ("30", "40")
+    ]
+    assert all(row["config"].startswith("bc batch_size=many (failed: ") and row["successes"] == "0" for row in rows[:2])
+    assert rows[2]["config"] == "bc" and rows[2]["commit"] and rows[2]["versions"].startswith("torch ")
+    model = tmp_path / "runs/ceborl/door-open-seed3/model.zip"
+    before = model.stat().st_mtime_ns
+    assert run_benchmark(tmp_path, grid, *options) == rows and model.stat().st_mtime_ns == before
+    # Other hyperparameters are another run: the table has it when it is there
+    methods["ceborl"] = {**methods["ceborl"], "changes": {"batch_size": 5}}
+    grid = write_grid(tmp_path, data, methods=methods)
+    assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["wrong"] * 2 + ["bc"] * 2
+
+
+def test_what_no_task_decides_is_trained_once(data, tmp_path):
+    grid = write_grid(tmp_path, data)
+    rows = run_benchmark(tmp_path, grid, "--methods", "bc")
+    assert [(row["task"], row["step"]) for row in rows] == [(task, step) for task in GRID["tasks"] for step in ("30", "40")]
+    assert [path.name for path in (tmp_path / "runs/bc").iterdir()] == ["seed3"]
+    cells = plan(load_grid(grid), tmp_path / "runs")
+    assert cells["bc", "door-open", 3] is cells["bc", "drawer-open", 3]
+    assert cells["cql", "door-open", 3] is not cells["cql", "drawer-open", 3]
+    tables = cells["bc", "door-open", 3].tables()
+    assert [list(table.seeds) for table in tables] == [[104_000, 104_001]] * 2
+    assert [table.env_kwargs["task"] for table in tables] == GRID["tasks"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_timesteps": 41}, "multiple of 4"),
+        ({"stepz": 1}, "stepz: unknown"),
+        ({"tasks": "door-open"}, "tasks: is 'door-open'; give a list"),
+        ({"methods": {"x": {"algo": "bc"}}}, "methods: x: config: missing"),
+        ({"save_freq": 0}, "save_freq: is 0"),
+        ({"methods": {"a b": GRID["methods"]["bc"], "a-b": GRID["methods"]["bc"]}}, "share a folder"),
+        ({"examples": None}, "ceborl learns from success examples"),
+        ({"examples": "nowhere/{task}.h5"}, "no such success examples"),
+    ],
+)
+def test_a_wrong_grid_is_refused_before_anything_runs(data, tmp_path, changes, message):
+    with pytest.raises(SystemExit, match=message):
+        run_benchmark(tmp_path, write_grid(tmp_path, data, **changes))
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name", ["table1_states", "table1_pixels", "ceborl_states"])
+def test_shipped_grids_can_be_planned(name, tmp_path):
+    grid = load_grid(name)
+    assert len(plan(grid, tmp_path)) == len(grid.methods) * len(grid.tasks) * len(grid.seeds)
+    assert (grid.checkpoints, grid.episodes) == (5, 10)
+
+
+def assert_same(one, other):
+    """Of nested dicts and lists of tensors: policies and optimizers."""
+    if isinstance(one, th.Tensor):
+        assert th.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        assert_same(list(one.values()), list(other.values()))
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other)
+        for pair in zip(one, other, strict=True):
+            assert_same(*pair)
+    else:
+        assert one == other
