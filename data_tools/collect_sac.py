@@ -39,6 +39,8 @@ from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
 POLICIES = Path(__file__).parent / "policies"
+SAMPLES = Path(__file__).parent / "samples"
+"""``sac_states.h5`` and ``sac_pixels.h5``: four episodes a task of seed 1, compressed."""
 PAPER_SHARES = {"dial-turn": 0.33, "door-open": 0.31, "drawer-open": 0.28, "lever-pull": 0.35, "plate-slide": 0.33}
 """Of successful episodes, by task, as the CEBORL paper reports of its data."""
 BEHAVIOUR = "stock SB3 SAC agents, trained for one task each from states, at several points of their training; sampled actions"
