@@ -191,9 +191,7 @@ class OfflineCritic(ContinuousCritic):
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
             of_state = linear(features, state_weight, q_net[0].bias)
-            relu = len(q_net) > 1 and type(q_net[1]) is nn.ReLU
-            hidden = linear(samples.flatten(0, 1), action_weight, of_state, relu)
-            outputs.append(run_layers(list(q_net)[1 + relu :], hidden).view(samples.shape[:2]))
+            outputs.append(run_layers(list(q_net), samples.flatten(0, 1), (action_weight, of_state)).view(samples.shape[:2]))
         return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
