@@ -35,24 +35,32 @@ def _signed(tensor: th.Tensor) -> th.Tensor:
     return tensor.view(th.int16) if tensor.dtype == th.bfloat16 else tensor
 
 
-class _Layers(th.autograd.Function):
+def _forward(
+    x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]
+) -> tuple[list[th.Tensor], list[th.Tensor]]:
+    """:return: weights in the dtype of ``x``; and ``x`` with the outputs of all layers"""
     # Outputs lie in memory with their features first, (out_features, rows). So all three products, forward and backward, find
-    # the long axis of both sides contiguous: transposing thousands of rows takes as long as multiplying them. All layers are
-    # one node of the graph, since with a few hundred rows PyTorch's work around a node takes as long as the node's own.
+    # the long axis of both sides contiguous: transposing thousands of rows takes as long as multiplying them.
+    weights, inputs = [], [x]
+    for relu, weight, bias in zip(relus, parameters[::2], parameters[1::2], strict=True):
+        assert weight is not None
+        # A first layer's weights may be columns of a wider matrix: oneDNN is a thousand times slower where rows have gaps.
+        weights.append(weight.to(x.dtype).contiguous())
+        output = _product(weights[-1], inputs[-1]).t()
+        if bias is not None:
+            output.view(-1, *bias.shape).add_(bias.to(x.dtype))
+        if relu:
+            _signed(output).clamp_min_(0)
+        inputs.append(output)
+    return weights, inputs
+
+
+class _Layers(th.autograd.Function):
+    # All layers are one node of the graph: with a few hundred rows, PyTorch's work around a node takes as long as the node's.
 
     @staticmethod
     def forward(ctx: Any, x: th.Tensor, relus: Sequence[bool], *parameters: th.Tensor | None) -> th.Tensor:
-        weights, inputs = [], [x]
-        for relu, weight, bias in zip(relus, parameters[::2], parameters[1::2], strict=True):
-            assert weight is not None
-            # A first layer's weights may be columns of a wider matrix: oneDNN is a thousand times slower where rows have gaps.
-            weights.append(weight.to(x.dtype).contiguous())
-            output = _product(weights[-1], inputs[-1]).t()
-            if bias is not None:
-                output.view(-1, *bias.shape).add_(bias.to(x.dtype))
-            if relu:
-                _signed(output).clamp_min_(0)
-            inputs.append(output)
+        weights, inputs = _forward(x, relus, parameters)
         ctx.relus = relus
         ctx.shapes = [() if parameter is None else parameter.shape for parameter in parameters]
         ctx.dtypes = [None if parameter is None else parameter.dtype for parameter in parameters]
@@ -101,6 +109,12 @@ def has_fast_bfloat16(device: th.device) -> bool:
     return device.type == "cpu" and any(check() for check in checks if check is not None)
 
 
+def _run(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]) -> th.Tensor:
+    if th.is_grad_enabled():
+        return _Layers.apply(x, relus, *parameters)  # type: ignore[no-untyped-call]
+    return _forward(x, relus, parameters)[1][-1]
+
+
 def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
     """
     ``x @ weight.T + bias``, in the dtype of ``x``; gradients of the parameters come in the parameters' own dtype.
@@ -110,7 +124,7 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th
     :param bias: ``(out_features,)``; or ``(b, out_features)``, one for each of b rows, for the next b rows again, and so on
     :return: ``(rows, out_features)``
     """
-    return _Layers.apply(x, (False,), weight, bias)  # type: ignore[no-untyped-call]
+    return _run(x, (False,), (weight, bias))
 
 
 def run_layers(
@@ -135,6 +149,6 @@ def run_layers(
             relus[-1] = True
         else:
             if relus:
-                x, relus, parameters = _Layers.apply(x, relus, *parameters), [], []  # type: ignore[no-untyped-call]
+                x, relus, parameters = _run(x, relus, parameters), [], []
             x = layer(x.to(layer.weight.dtype)).to(x.dtype) if isinstance(layer, nn.LayerNorm) else layer(x)
-    return _Layers.apply(x, relus, *parameters) if relus else x  # type: ignore[no-untyped-call]
+    return _run(x, relus, parameters) if relus else x

@@ -205,7 +205,7 @@ class OfflineCritic(ContinuousCritic):
 
     @property
     def _parameter_dtype(self) -> th.dtype:
-        return next(self.q_networks[0].parameters()).dtype
+        return self.q_networks[0][-1].weight.dtype  # type: ignore
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
@@ -294,6 +294,10 @@ class OfflinePolicy(SACPolicy):
         ]
         self.actor.optimizer = self._make_optimizer(actor_parameters, lr_schedule)
         self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
+
+    def set_training_mode(self, mode: bool) -> None:
+        if mode != self.training:  # learners ask for it in each step, and a walk through all modules takes a while
+            super().set_training_mode(mode)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
         defaults = {"fused": True} if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}
