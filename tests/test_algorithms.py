@@ -261,8 +261,7 @@ def test_critic_values_many_actions_as_one_by_one(files):
 def test_rce_target_is_that_of_its_paper(n_steps, files):
     model = make("rce", "MlpPolicy", files, n_steps=n_steps)
     batch = model.replay_buffer.sample(8)
-    probabilities = iter([np.full((2, 8), 0.6), np.full((2, 8), 0.8)])
-    model._target_logits = lambda *_: th.logit(th.tensor(next(probabilities), dtype=th.float32))
+    model._target_logits = lambda _: [th.logit(th.full((2, 8), probability)) for probability in (0.6, 0.8)]
     omega = model._discounted_omega(batch).numpy()
     mean = np.full(8, 0.6)
     if n_steps == 3:

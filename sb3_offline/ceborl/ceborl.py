@@ -285,12 +285,12 @@ class CEBORL(ExampleBasedAlgorithm):
         :param batch: transitions
         :return: ``(batch,)``
         """
-        one_step = batch.discounts.squeeze(1) * self._omega(batch.next_observations, batch.next_actions)
+        omegas = [success_odds(logits, self.omega_max) for logits in self._target_logits(batch)]
+        one_step = batch.discounts.squeeze(1) * omegas[0]
         if self.n_steps == 1:
             return one_step
-        assert batch.nstep_observations is not None and batch.nstep_discounts is not None
-        n_step = batch.nstep_discounts.squeeze(1) * self._omega(batch.nstep_observations, batch.nstep_actions)
-        return 0.5 * (one_step + n_step)
+        assert batch.nstep_discounts is not None
+        return 0.5 * (one_step + batch.nstep_discounts.squeeze(1) * omegas[1])
 
     def _example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor | None:
         """:return: ``gamma * omega`` of examples as their own successors, where they count among the data"""
@@ -306,21 +306,26 @@ class CEBORL(ExampleBasedAlgorithm):
             loss = loss + self.example_share * recursive_loss(logits, example_omega)
         return loss
 
-    def _omega(self, observations: PyTorchObs, dataset_actions: th.Tensor | None) -> th.Tensor:
-        return success_odds(self._target_logits(observations, dataset_actions), self.omega_max)
-
-    def _target_logits(self, observations: PyTorchObs, dataset_actions: th.Tensor | None) -> th.Tensor:
-        observations = self.augment(observations)
-        if self.backup == "policy":
-            actions, _ = self.actor.sample(self.actor.encode(observations))
-            logits = self.critic_target.values(self.critic_target.encode(observations), actions)
+    def _target_logits(self, batch: OfflineSamples) -> tuple[th.Tensor, ...]:
+        """
+        :param batch: transitions
+        :return: the target's logits after one step and, for ``n_steps > 1``, after ``n_steps``, ``(n_critics, batch)`` each
+        """
+        successors, dataset_actions = [batch.next_observations], [batch.next_actions]
+        if self.n_steps > 1:
+            assert batch.nstep_observations is not None
+            successors, dataset_actions = [*successors, batch.nstep_observations], [*dataset_actions, batch.nstep_actions]
+        successors = [self.augment(observations) for observations in successors]
+        features = th.cat([self.critic_target.encode(observations) for observations in successors])
+        if self.backup == "expectile":
+            logits = self.critic_target.state_values(features).unsqueeze(0)
         elif self.backup == "dataset":
-            assert dataset_actions is not None
-            logits = self.critic_target.values(self.critic_target.encode(observations), dataset_actions)
+            logits = self.critic_target.values(features, th.cat(dataset_actions))  # type: ignore[arg-type]
         else:
-            logits = self.critic_target.state_values(self.critic_target.encode(observations)).unsqueeze(0)
+            actions, _ = self.actor.sample(th.cat([self.actor.encode(observations) for observations in successors]))
+            logits = self.critic_target.values(features, actions)
         self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
-        return logits
+        return logits.chunk(len(successors), dim=1)
 
     def _sample_penalized_actions(self, features: th.Tensor) -> th.Tensor:
         """

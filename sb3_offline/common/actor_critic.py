@@ -28,6 +28,8 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
     actor: OfflineActor
     critic: OfflineCritic
     critic_target: OfflineCritic
+    critic_parameters: list[th.Tensor]
+    critic_target_parameters: list[th.Tensor]
     batch_norm_stats: list[th.Tensor]
     batch_norm_stats_target: list[th.Tensor]
 
@@ -35,6 +37,9 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         super()._create_aliases()
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+        # Lists, since a walk through all modules in each step takes a while
+        self.critic_parameters = list(self.critic.parameters())
+        self.critic_target_parameters = list(self.critic_target.parameters())
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
@@ -60,22 +65,24 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         :param actions: ``(batch, action_dim)`` in [-1, 1]
         :return: ``(n_critics, batch)``
         """
-        heads = th.nn.ModuleList(self.critic.q_networks)
-        heads.requires_grad_(False)  # or the gradients of their weights would be computed and thrown away
+        for parameter in self.critic_parameters:  # or their gradients would be computed and thrown away
+            parameter.requires_grad_(False)
         try:
             return self.critic.values(features.detach(), actions)
         finally:
-            heads.requires_grad_(True)
+            for parameter in self.critic_parameters:
+                parameter.requires_grad_(True)
 
     def _update_target(self) -> None:
         if self._n_updates % self.target_update_interval == 0:
             with th.no_grad():
-                th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
+                th._foreach_lerp_(self.critic_target_parameters, self.critic_parameters, self.tau)
             # Running statistics of batch normalisation are copied, as in SB3's SAC.
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"]
+        critics = [name + suffix for name in ("critic", "critic_target") for suffix in ("", "_parameters")]
+        return [*super()._excluded_save_params(), *critics, "batch_norm_stats", "batch_norm_stats_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

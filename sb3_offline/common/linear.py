@@ -30,43 +30,71 @@ def _product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
     return left @ right.t()
 
 
-class _Linear(th.autograd.Function):
+def _signed(tensor: th.Tensor) -> th.Tensor:
+    """:return: the same memory, to look for signs: PyTorch looks at bfloat16 by way of float32, and takes six times as long"""
+    return tensor.view(th.int16) if tensor.dtype == th.bfloat16 else tensor
+
+
+def _forward(
+    x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]
+) -> tuple[list[th.Tensor], list[th.Tensor]]:
+    """:return: weights in the dtype of ``x``; and ``x`` with the outputs of all layers"""
     # Outputs lie in memory with their features first, (out_features, rows). So all three products, forward and backward, find
     # the long axis of both sides contiguous: transposing thousands of rows takes as long as multiplying them.
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, relu: bool) -> th.Tensor:
-        ctx.relu, ctx.parameter_dtype = relu, weight.dtype
+    weights, inputs = [], [x]
+    for relu, weight, bias in zip(relus, parameters[::2], parameters[1::2], strict=True):
+        assert weight is not None
         # A first layer's weights may be columns of a wider matrix: oneDNN is a thousand times slower where rows have gaps.
-        weight = weight.to(x.dtype).contiguous()
-        output = _product(weight, x).t()
+        weights.append(weight.to(x.dtype).contiguous())
+        output = _product(weights[-1], inputs[-1]).t()
         if bias is not None:
             output.view(-1, *bias.shape).add_(bias.to(x.dtype))
         if relu:
-            output.relu_()
-        if bias is not None:
-            ctx.bias_shape, ctx.bias_dtype = bias.shape, bias.dtype
-        ctx.save_for_backward(x, weight, output if relu else None)
-        return output
+            _signed(output).clamp_min_(0)
+        inputs.append(output)
+    return weights, inputs
+
+
+class _Layers(th.autograd.Function):
+    # All layers are one node of the graph: with a few hundred rows, PyTorch's work around a node takes as long as the node's.
+
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor, relus: Sequence[bool], *parameters: th.Tensor | None) -> th.Tensor:
+        weights, inputs = _forward(x, relus, parameters)
+        ctx.relus = relus
+        ctx.shapes = [() if parameter is None else parameter.shape for parameter in parameters]
+        ctx.dtypes = [None if parameter is None else parameter.dtype for parameter in parameters]
+        ctx.save_for_backward(*weights, *(inputs if relus[-1] else inputs[:-1]))
+        return inputs[-1]
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
-        x, weight, output = ctx.saved_tensors
-        needs_x, needs_weight, needs_bias, _ = ctx.needs_input_grad
-        if ctx.relu:
-            # Into the output, which no one reads any more: fresh memory would cost more than the operation.
-            gradient = th.ops.aten.threshold_backward.grad_input(gradient, output, 0, grad_input=output)
-        by_feature = gradient.t().contiguous()
-        bias_gradient = None
-        if needs_bias:
-            rows = ctx.bias_shape[0] if len(ctx.bias_shape) == 2 else 1
-            bias_gradient = by_feature.view(len(by_feature), -1, rows).sum(dim=1).t().reshape(ctx.bias_shape)
-        return (
-            _product(weight.t(), by_feature.t()).t() if needs_x else None,
-            _product(by_feature, x.t()).to(ctx.parameter_dtype) if needs_weight else None,
-            None if bias_gradient is None else bias_gradient.to(ctx.bias_dtype),
-            None,
-        )
+        n_layers = len(ctx.relus)
+        weights, inputs = ctx.saved_tensors[:n_layers], ctx.saved_tensors[n_layers:]
+        gradients: list[th.Tensor | None] = [None] * len(ctx.needs_input_grad)
+        for layer in reversed(range(n_layers)):
+            if ctx.relus[layer]:
+                # Into the output, which no one reads any more: fresh memory would cost more than the operation.
+                output = _signed(inputs[layer + 1])
+                th.ops.aten.threshold_backward.grad_input(_signed(gradient), output, 0, grad_input=output)
+                gradient = inputs[layer + 1]
+            by_feature = gradient.t().contiguous()
+            of_weight, of_bias = 2 + 2 * layer, 3 + 2 * layer
+            if ctx.needs_input_grad[of_bias]:
+                shape, dtype = ctx.shapes[2 * layer + 1], ctx.dtypes[2 * layer + 1]
+                rows = shape[0] if len(shape) == 2 else 1
+                gradients[of_bias] = by_feature.view(len(by_feature), -1, rows).sum(dim=1).t().reshape(shape).to(dtype)
+            if ctx.needs_input_grad[of_weight]:
+                x = inputs[layer].t()
+                # oneDNN likes the many features on its right
+                of_weights = _product(x, by_feature).t() if len(x) < len(by_feature) else _product(by_feature, x)
+                gradients[of_weight] = of_weights.to(ctx.dtypes[2 * layer])
+            if not any(ctx.needs_input_grad[:of_weight]):
+                break
+            gradient = _product(weights[layer].t(), by_feature.t()).t()
+        else:
+            gradients[0] = gradient
+        return tuple(gradients)
 
 
 @functools.lru_cache
@@ -81,36 +109,46 @@ def has_fast_bfloat16(device: th.device) -> bool:
     return device.type == "cpu" and any(check() for check in checks if check is not None)
 
 
-def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, relu: bool = False) -> th.Tensor:
+def _run(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]) -> th.Tensor:
+    if th.is_grad_enabled():
+        return _Layers.apply(x, relus, *parameters)  # type: ignore[no-untyped-call]
+    return _forward(x, relus, parameters)[1][-1]
+
+
+def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
     """
     ``x @ weight.T + bias``, in the dtype of ``x``; gradients of the parameters come in the parameters' own dtype.
 
     :param x: ``(rows, in_features)``
     :param weight: ``(out_features, in_features)``
     :param bias: ``(out_features,)``; or ``(b, out_features)``, one for each of b rows, for the next b rows again, and so on
-    :param relu: whether a ReLU follows
     :return: ``(rows, out_features)``
     """
-    return _Linear.apply(x, weight, bias, relu)  # type: ignore[no-untyped-call]
+    return _run(x, (False,), (weight, bias))
 
 
-def run_layers(layers: Sequence[nn.Module], x: th.Tensor) -> th.Tensor:
+def run_layers(
+    layers: Sequence[nn.Module], x: th.Tensor, first: tuple[th.Tensor, th.Tensor | None] | None = None
+) -> th.Tensor:
     """
     What ``nn.Sequential(*layers)`` does.
 
     :param layers: linear layers and whatever stands between them
     :param x: ``(rows, in_features)``; its dtype is that of the products
+    :param first: weight and bias in place of those of the first layer, as :func:`linear` takes them
     :return: ``(rows, out_features)``
     """
-    skip = False
-    for index, layer in enumerate(layers):
-        if skip:
-            skip = False
-        elif isinstance(layer, nn.Linear):
-            skip = index + 1 < len(layers) and type(layers[index + 1]) is nn.ReLU
-            x = linear(x, layer.weight, layer.bias, relu=skip)
-        elif isinstance(layer, nn.LayerNorm):
-            x = layer(x.to(layer.weight.dtype)).to(x.dtype)
+    relus: list[bool] = []
+    parameters: list[th.Tensor | None] = []
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            relus.append(False)
+            parameters += (layer.weight, layer.bias) if first is None else first
+            first = None
+        elif type(layer) is nn.ReLU and relus and not relus[-1]:
+            relus[-1] = True
         else:
-            x = layer(x)
-    return x
+            if relus:
+                x, relus, parameters = _run(x, relus, parameters), [], []
+            x = layer(x.to(layer.weight.dtype)).to(x.dtype) if isinstance(layer, nn.LayerNorm) else layer(x)
+    return _run(x, relus, parameters) if relus else x

@@ -191,9 +191,7 @@ class OfflineCritic(ContinuousCritic):
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
             of_state = linear(features, state_weight, q_net[0].bias)
-            relu = len(q_net) > 1 and type(q_net[1]) is nn.ReLU
-            hidden = linear(samples.flatten(0, 1), action_weight, of_state, relu)
-            outputs.append(run_layers(list(q_net)[1 + relu :], hidden).view(samples.shape[:2]))
+            outputs.append(run_layers(list(q_net), samples.flatten(0, 1), (action_weight, of_state)).view(samples.shape[:2]))
         return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
@@ -207,7 +205,7 @@ class OfflineCritic(ContinuousCritic):
 
     @property
     def _parameter_dtype(self) -> th.dtype:
-        return next(self.q_networks[0].parameters()).dtype
+        return self.q_networks[0][-1].weight.dtype  # type: ignore
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
@@ -296,6 +294,10 @@ class OfflinePolicy(SACPolicy):
         ]
         self.actor.optimizer = self._make_optimizer(actor_parameters, lr_schedule)
         self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
+
+    def set_training_mode(self, mode: bool) -> None:
+        if mode != self.training:  # learners ask for it in each step, and a walk through all modules takes a while
+            super().set_training_mode(mode)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
         defaults = {"fused": True} if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}

@@ -54,8 +54,7 @@ class RCE(CEBORL):
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         if self.n_steps == 1:
             return super()._discounted_omega(batch)
-        assert batch.nstep_observations is not None and batch.nstep_discounts is not None
-        one_step = self._target_logits(batch.next_observations, batch.next_actions).sigmoid()
-        n_step = self._target_logits(batch.nstep_observations, batch.nstep_actions).sigmoid()
+        assert batch.nstep_discounts is not None
+        one_step, n_step = (logits.sigmoid() for logits in self._target_logits(batch))
         mean = 0.5 * (one_step + batch.nstep_discounts.squeeze(1) * n_step)
         return self.gamma * success_odds(th.logit(mean, eps=1e-7), self.omega_max)
