@@ -114,11 +114,10 @@ def test_default_form(dataset, monkeypatch):
     state = recursive(v, weight) + (1 - GAMMA) * prior * softplus(-v_examples).mean()
     state += share * recursive(v_examples, example_weight)
 
-    scale = np.exp(f_examples.min(axis=0)).mean()
-    eps = floor * scale
+    eps = floor * np.exp(f_examples.min(axis=0)).mean()
     weights = ((np.exp(f.min(axis=0)) + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
-    weights = np.minimum(weights, weight_max) * np.minimum((np.exp(v) + eps) / scale, 1) ** exponent
+    weights = np.minimum(weights, weight_max) * (np.exp(v) / (np.exp(v) + eps)) ** exponent
     monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n].numpy())
     with th.no_grad():
         mean, log_std = (x.double().numpy() for x in model.actor.gaussian_parameters(model.actor.encode(batch.observations)))

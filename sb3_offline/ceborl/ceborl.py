@@ -88,8 +88,8 @@ class CEBORL(ExampleBasedAlgorithm):
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
     :param advantage_floor: odds, as a share of the examples' odds, under which advantages are noise and count little
     :param weight_max: bound of the advantage weights
-    :param state_exponent: states count by this power of their odds, relative to the examples'. Advantages say which action is
-        better in a state; most states of a mixed dataset lead nowhere, and what is best there matters little.
+    :param state_exponent: states whose odds are under the floor count less, by this power. Advantages say which action is better in
+        a state; most states of a mixed dataset lead nowhere, and what is best there matters little.
     :param policy_batches: the policy learns from the transitions of the last so many batches, drawn by their weights
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps

@@ -85,12 +85,13 @@ def advantage_weights(
     state_exponent: float = 0.0,
 ) -> th.Tensor:
     """
-    How much more the data's action promises than the data's actions do on average in its state, times how much that state
-    promises: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * ((odds(s) + eps) / odds*) ** state_exponent``,
-    with the examples' mean odds ``odds*``.
+    How much more the data's action promises than the data's actions do on average in its state, times how surely that state
+    promises anything: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) **
+    state_exponent``.
 
     A ratio, since odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share of the examples'
-    odds: where both odds are far under it, their ratio is noise, and the weight is about 1.
+    odds. Where both odds are far under it, their ratio is noise, the first factor is about 1, and the second is small; where
+    they are above it, the second is about 1: the way to success counts as much as its end.
 
     :param data_logits: logits of dataset actions, ``(n_critics, batch)``
     :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
@@ -105,7 +106,6 @@ def advantage_weights(
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
     example_odds = success_odds(example_logits, OVERFLOW).mean()
     eps = advantage_floor * example_odds
-    log_state_odds = th.log(state_odds + eps)
-    log_ratio = th.log(odds + eps) - log_state_odds
-    log_share = (log_state_odds - th.log(example_odds)).clamp(max=0.0)
-    return ((log_ratio / temperature).clamp(max=math.log(weight_max)) + state_exponent * log_share).exp()
+    log_ratio = th.log(odds + eps) - th.log(state_odds + eps)
+    weights = (log_ratio / temperature).clamp(max=math.log(weight_max)).exp()
+    return weights * (state_odds / (state_odds + eps)) ** state_exponent
