@@ -10,12 +10,14 @@ sb3_offline/benchmark/grid.py. Nothing is chosen by its score.
 
 import argparse
 import csv
+import functools
 from pathlib import Path
 from typing import Any
 
 from scripted_data import TASKS, add_arguments, prepare_data
 
 from sb3_offline.benchmark.grid import Grid, Method
+from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import run_grid
 from sb3_offline.benchmark.table import write_table
 from sb3_offline.ceborl import PAPER_FORM
@@ -94,7 +96,8 @@ def main() -> None:
         dataset=str(args.data),
         examples=str(args.examples_dir / "state-{task}.h5"),
     )
-    for line in run_grid(grid, args.runs, args.output, 0 if args.no_training else args.workers, write_variants):
+    train = None if args.no_training else functools.partial(train_locally, n_workers=args.workers)
+    for line in run_grid(grid, args.runs, args.output, train, write_variants):
         print(line, flush=True)
     plot(args.output, args.figure)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_offline.demo.pipeline import result_table
+from sb3_offline.report.results import comparison_table, read_results
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK = re.compile(r"(<!-- (results/\S+\.(?:csv|json)) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -25,6 +26,8 @@ def table(path: Path) -> str:
     if path.suffix == ".json":
         content = json.loads(path.read_text())
         return throughput_table(content) if isinstance(content, list) else card_table(content)
+    if path.stem.startswith("table1"):
+        return comparison_table(read_results(path))
     with path.open() as file:
         rows = list(csv.DictReader(file))
     if "library" in rows[0]:

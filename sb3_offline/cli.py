@@ -1,6 +1,7 @@
 """The command ``sb3-offline``: parse, call the library, print."""
 
 import argparse
+import functools
 import os
 import sys
 from collections.abc import Callable
@@ -31,6 +32,7 @@ _EXTRAS = {
     "minari": "minari",
     "pyarrow": "imitation",
     "ray": "ray",
+    "rliable": "report",
 }
 
 
@@ -55,6 +57,7 @@ def _parser(chosen: list[str]) -> argparse.ArgumentParser:
     add("train", "train one policy", _train)
     add("evaluate", "play a trained policy", _evaluate)
     add("benchmark", "train and evaluate a grid of methods, tasks and seeds", _benchmark)
+    add("report", "make tables and figures of a benchmark's results", _report)
     add("demo", "collect, train, evaluate and report, all by itself", _demo)
     return parser
 
@@ -143,16 +146,22 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
 
 
 def _evaluate(parser: argparse.ArgumentParser) -> Callable:
-    parser.add_argument("model", type=Path, help="model.zip of a run")
+    parser.add_argument("model", type=Path, help="model.zip of a run, or a policy of benchmark --policies")
+    parser.add_argument("--task", help="of the multimodal environment (default: the run's)")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=100_000, help="of the episodes")
     parser.add_argument("--gif", type=Path, help="record some of them")
 
     def run(args: argparse.Namespace) -> None:
         from sb3_offline.experiment.evaluation import evaluate_success
-        from sb3_offline.experiment.training import load_run
 
-        model, run_config = load_run(args.model)
+        if args.model.suffix == ".npz":
+            from sb3_offline.experiment.policy_file import load_policy as load
+        else:
+            from sb3_offline.experiment.training import load_run as load  # type: ignore[assignment]
+        model, run_config = load(args.model)
+        if args.task:
+            run_config["env_kwargs"]["task"] = args.task
         result = evaluate_success(model, run_config["env"], run_config["env_kwargs"], args.episodes, args.seed)
         low, high = result.interval
         print(f"{sum(result.successes)} of {args.episodes} episodes solved: {result.success_rate:.2f} [{low:.2f}, {high:.2f}]")
@@ -172,18 +181,46 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="CSV file, written anew after every run")
     parser.add_argument("--workers", type=int, help="runs at once, one thread each (default: as many as there are cores)")
+    parser.add_argument("--ray-address", help='train on a Ray cluster that shares the file system ("auto", "local")')
     parser.add_argument("--methods", nargs="+", help="some of the grid's only")
     parser.add_argument("--tasks", nargs="+", help="likewise")
     parser.add_argument("--seeds", nargs="+", type=int, help="likewise")
     parser.add_argument("--no-training", action="store_true", help="write the table of what is finished")
+    parser.add_argument("--policies", type=Path, help="folder for the final policies as small files")
 
     def run(args: argparse.Namespace) -> None:
         from sb3_offline.benchmark.grid import load_grid
-        from sb3_offline.benchmark.runner import run_grid
+        from sb3_offline.benchmark.runner import export_policies, run_grid
 
+        train: Callable | None = None
+        if args.ray_address:
+            from sb3_offline.benchmark.on_ray import train_on_ray
+
+            train = functools.partial(train_on_ray, address=args.ray_address)
+        elif not args.no_training:
+            from sb3_offline.benchmark.local import train_locally
+
+            train = functools.partial(train_locally, n_workers=args.workers or os.cpu_count() or 1)
         grid = load_grid(args.grid).part(args.methods, args.tasks, args.seeds)
-        n_workers = 0 if args.no_training else args.workers or os.cpu_count() or 1
-        for line in run_grid(grid, args.runs, args.output, n_workers):
+        for line in run_grid(grid, args.runs, args.output, train):
+            print(line, flush=True)
+        if args.policies:
+            print(f"{export_policies(grid, args.runs, args.policies)} policies -> {args.policies}")
+
+    return run
+
+
+def _report(parser: argparse.ArgumentParser) -> Callable:
+    parser.add_argument("tables", nargs="+", type=Path, help="CSV files of sb3-offline benchmark")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for report.md and its figures")
+    parser.add_argument("--runs", nargs="+", type=Path, default=[], help="folder of the runs of each: adds film strips")
+    parser.add_argument("--reference", default="ceborl", help="the method that others are compared with (default: ceborl)")
+    parser.add_argument("--notes", type=Path, help="a Markdown file to begin with")
+
+    def run(args: argparse.Namespace) -> None:
+        from sb3_offline.report.report import write_report
+
+        for line in write_report(args.tables, args.output, args.runs, args.reference, args.notes):
             print(line, flush=True)
 
     return run

@@ -7,54 +7,27 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
-import torch as th
-import yaml
 
 pytest.importorskip("metaworld")
+
+from grids import GRID, assert_same, collect_data, write_grid
 
 from sb3_offline import cli
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.table import table_rows
 from sb3_offline.benchmark.worker import LOCK_FILE, train_run
-from sb3_offline.data.examples import save_examples
-from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_scripted import collect_scripted
-from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.experiment.policy_file import load_policy
 from sb3_offline.experiment.training import RESUME_FILE, load_run
 
 TABLE = "evaluations-door-open.csv"
-GRID = {
-    "env": "MultimodalMetaworld-v0",
-    "tasks": ["door-open", "drawer-open"],
-    "seeds": [3],
-    "n_timesteps": 40,
-    "save_freq": 5,
-    "checkpoints": 2,
-    "episodes": 1,
-    "methods": {
-        "ceborl": {"algo": "ceborl", "config": "ceborl", "changes": {"batch_size": 16}},
-        "cql": {"algo": "cql", "config": "cql", "changes": {"batch_size": 16}},
-        "bc": {"algo": "bc", "config": "bc"},
-    },
-}
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data")
-    collect_scripted(folder / "data.h5", episodes_per_task=8, tasks=GRID["tasks"], n_workers=1)
-    dataset = OfflineDataset(folder / "data.h5")
-    for task in GRID["tasks"]:
-        examples, provenance = extract_examples(folder / "data.h5", 5, source=task)
-        save_examples(folder / f"{task}.h5", examples, dataset.observation_space, provenance)
-    return {"dataset": str(folder / "data.h5"), "examples": str(folder / "{task}.h5")}
-
-
-def write_grid(folder, data, **changes):
-    (folder / "grid.yml").write_text(yaml.safe_dump({**GRID, **data, **changes}))
-    return str(folder / "grid.yml")
+    return collect_data(tmp_path_factory.mktemp("data"))
 
 
 def run_benchmark(folder, grid, *options):
@@ -125,6 +98,14 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path):
     assert [list(table.seeds) for table in tables] == [[104_000, 104_001]] * 2
     assert [table.env_kwargs["task"] for table in tables] == GRID["tasks"]
 
+    run_benchmark(tmp_path, grid, "--methods", "bc", "--no-training", "--policies", str(tmp_path / "policies"))
+    small = tmp_path / "policies/bc/seed3.npz"
+    policy, config = load_policy(small)
+    model, _ = load_run(tmp_path / "runs/bc/seed3/model.zip")
+    observations = np.random.default_rng(0).normal(size=(5, *model.observation_space.shape)).astype(np.float32)
+    assert (policy.predict(observations, deterministic=True)[0] == model.predict(observations, deterministic=True)[0]).all()
+    assert config["env"] == GRID["env"] and small.stat().st_size < 1_000_000
+
 
 @pytest.mark.parametrize(
     ("changes", "message"),
@@ -150,18 +131,3 @@ def test_shipped_grids_can_be_planned(name, tmp_path):
     grid = load_grid(name)
     assert len(plan(grid, tmp_path)) == len(grid.methods) * len(grid.tasks) * len(grid.seeds)
     assert (grid.checkpoints, grid.episodes) == (5, 10)
-
-
-def assert_same(one, other):
-    """Of nested dicts and lists of tensors: policies and optimizers."""
-    if isinstance(one, th.Tensor):
-        assert th.equal(one, other)
-    elif isinstance(one, dict):
-        assert one.keys() == other.keys()
-        assert_same(list(one.values()), list(other.values()))
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(other)
-        for pair in zip(one, other, strict=True):
-            assert_same(*pair)
-    else:
-        assert one == other

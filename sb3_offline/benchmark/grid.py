@@ -126,7 +126,7 @@ class Run:
         :return: the callback that evaluates the run's policy on it
         """
         grid, config = self.grid, self.arguments["config"]
-        steps, first_seed = grid.evaluation_steps(), EVALUATION_SEED + 1000 * (1 + self.arguments["seed"])
+        steps = grid.evaluation_steps()
         return EvaluationTable(
             self.folder / f"evaluations-{task}.csv",
             grid.env,
@@ -134,7 +134,7 @@ class Run:
             eval_freq=grid.n_timesteps // (2 * grid.checkpoints),
             n_episodes=grid.episodes,
             eval_start=steps[0],
-            seeds=range(first_seed, first_seed + grid.checkpoints),
+            seeds=[evaluation_seed(self.arguments["seed"], index) for index in range(grid.checkpoints)],
         )
 
     def record(self) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def _run(grid: Grid, name: str, seed: int, tasks: tuple[str, ...], runs: Path) -
         "algo": method.algo,
         "env_id": grid.env,
         "config": {**config, "n_timesteps": grid.n_timesteps},
-        "output": runs / _folder_name(name) / (f"{tasks[0]}-seed{seed}" if of_task else f"seed{seed}"),
+        "output": _run_folder(runs, name, seed, tasks[0] if of_task else None),
         "dataset": _filled(grid.dataset, tasks[0]),
         "examples": _filled(grid.examples, tasks[0]) if _takes_examples(method) else None,
         "env_kwargs": {"task": tasks[0]} if of_task else {},
@@ -243,6 +243,31 @@ def _depends_on_task(grid: Grid, method: Method) -> bool:
 def _filled(paths: Any, task: str) -> Any:
     """:return: the path or the paths of a task"""
     return [_filled(path, task) for path in paths] if isinstance(paths, list) else paths and paths.replace("{task}", task)
+
+
+def evaluation_seed(seed: int, checkpoint: int) -> int:
+    """
+    :param seed: of a run
+    :param checkpoint: 0 for the first one that counts
+    :return: seed of that evaluation's episodes
+    """
+    return EVALUATION_SEED + 1000 * (1 + seed) + checkpoint
+
+
+def cell_folder(runs: Path, method: str, task: str, seed: int) -> Path:
+    """
+    :param runs: folder of all runs
+    :param method: of a cell
+    :param task: of it
+    :param seed: of it
+    :return: folder of the run that fills it
+    """
+    own = _run_folder(runs, method, seed, task)
+    return own if own.is_dir() else _run_folder(runs, method, seed, None)
+
+
+def _run_folder(runs: Path, method: str, seed: int, task: str | None) -> Path:
+    return runs / _folder_name(method) / (f"seed{seed}" if task is None else f"{task}-seed{seed}")
 
 
 def _folder_name(name: str) -> str:

@@ -1,17 +1,22 @@
 """From a grid to its table."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from sb3_offline.benchmark.grid import Grid, Run, plan
-from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.table import failure_of, table_rows, write_table
 from sb3_offline.data.reader import open_datasets
+from sb3_offline.experiment.policy_file import save_policy
+from sb3_offline.experiment.training import load_run
 
 
 def run_grid(
-    grid: Grid, runs: Path, output: Path, n_workers: int, write: Callable[[Path, list], None] = write_table
+    grid: Grid,
+    runs: Path,
+    output: Path,
+    train: Callable[[list[Run]], Iterable[Run]] | None,
+    write: Callable[[Path, list], None] = write_table,
 ) -> Iterator[str]:
     """
     Train what is not finished, and write the table at once and after every run.
@@ -19,20 +24,33 @@ def run_grid(
     :param grid: what is asked for
     :param runs: folder of the runs
     :param output: CSV file
-    :param n_workers: runs at once; 0 trains nothing
+    :param train: trains runs and gives back each when it is over; ``None`` to write the table of what is finished
     :param write: gets ``output`` and the rows of :func:`~sb3_offline.benchmark.table.table_rows`
     :return: what to tell the user, when it happens
     """
     cells, began = plan(grid, runs), time.monotonic()
     trainings = list({run.folder: run for run in cells.values()}.values())
-    unfinished = [run for run in trainings if not run.is_finished()] if n_workers else []
+    unfinished = [run for run in trainings if not run.is_finished()] if train else []
     _check_files(unfinished)
     write(output, table_rows(cells))
     yield f"{len(trainings)} runs fill {len(cells)} cells; {len(unfinished)} are to be trained"
-    for number, run in enumerate(train_locally(unfinished, n_workers), start=1):
+    for number, run in enumerate(train(unfinished) if train else [], start=1):
         write(output, table_rows(cells))
         minutes = (time.monotonic() - began) / 60
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
+
+
+def export_policies(grid: Grid, runs: Path, folder: Path) -> int:
+    """
+    :param grid: whose runs are exported
+    :param runs: folder of the runs
+    :param folder: gets the final policy of each finished run as a file named like the run's folder
+    :return: how many there are
+    """
+    finished = {run.folder for run in plan(grid, runs).values() if run.is_finished()}
+    for source in sorted(finished):
+        save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / "model.zip"))
+    return len(finished)
 
 
 def _check_files(runs: list[Run]) -> None:

@@ -14,22 +14,25 @@ FRAME_MS = 80
 LAST_FRAME_MS = 800
 
 
-def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None) -> tuple[list[np.ndarray], bool]:
+def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None) -> tuple[list[np.ndarray], int | None]:
     """
     :param model: plays its mode
     :param env: with ``render_mode="rgb_array"``
     :param seed: of the episode; ``None`` goes on with the environment's own generator
-    :return: frames uint8, one a decision, until the task is solved and a little longer; and whether it was
+    :return: frames uint8, one a decision, until the task is solved and a little longer; and the decision that
+        solved it, if one did
     """
     observation, _ = env.reset(seed=seed)
-    frames, solved_for, done = [env.render()], 0, False
+    frames, solved_at, solved_for, done = [env.render()], None, 0, False
     while not done and solved_for < 5:
         action, _ = model.predict(observation, deterministic=True)
         observation, _, terminated, truncated, info = env.step(action)
         frames.append(env.render())
         done = terminated or truncated
         solved_for += bool(info["is_success"])
-    return frames, solved_for > 0  # type: ignore[return-value]
+        if solved_for == 1 and solved_at is None:
+            solved_at = len(frames) - 1
+    return frames, solved_at  # type: ignore[return-value]
 
 
 def record_gif(
@@ -57,7 +60,8 @@ def record_gif(
     env = gym.make(env_id, render_mode="rgb_array", width=size, height=size, **env_kwargs)
     pictures, durations, outcomes = [], [], []
     for index in range(n_episodes):
-        frames, solved = record_episode(model, env, seed if index == 0 else None)
+        frames, solved_at = record_episode(model, env, seed if index == 0 else None)
+        solved = solved_at is not None
         outcomes.append(solved)
         for number, frame in enumerate(frames):
             picture = Image.fromarray(frame)

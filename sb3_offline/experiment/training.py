@@ -160,9 +160,9 @@ def create_model(
     :return: a model, not trained
     """
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
-    arguments.update(**_data_arguments(config, dataset, examples), seed=seed, **kwargs)
+    arguments = {**arguments, "env": None, **_data_arguments(config, dataset, examples), "seed": seed, **kwargs}
     try:
-        return find_algorithm(algo)(env=None, **arguments)  # type: ignore[arg-type]
+        return find_algorithm(algo)(**arguments)
     except TypeError as error:
         raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams and --examples") from error
 

@@ -1,0 +1,60 @@
+"""What plays, and nothing else: the actor's weights in a small file."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.common.stub_env import SpacesOnlyEnv
+from sb3_offline.data.files import replacing
+from sb3_offline.data.spaces import space_from_json, space_to_json
+from sb3_offline.experiment.training import create_model
+
+#: Of more bytes than this, weights are kept in half precision.
+FULL_PRECISION_BYTES = 1_000_000
+_DESCRIPTION = "description"
+_KEPT = ("algo", "env", "env_kwargs", "seed", "n_timesteps", "policy", "policy_kwargs")
+
+
+def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> None:
+    """
+    :param path: of the ``.npz`` file
+    :param model: whose actor is kept
+    :param config: of its run, as :func:`~sb3_offline.experiment.training.load_run` returns it
+    """
+    weights = {name: value.cpu().numpy() for name, value in model.actor.state_dict().items()}
+    parameters = {name for name, _ in model.actor.named_parameters()}
+    if sum(array.nbytes for array in weights.values()) > FULL_PRECISION_BYTES:
+        weights = {name: array.astype(np.float16) if name in parameters else array for name, array in weights.items()}
+    description = {
+        **{key: config[key] for key in _KEPT if key in config},
+        "observation_space": space_to_json(model.observation_space),
+        "action_space": space_to_json(model.action_space),
+    }
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        arrays: dict[str, Any] = {**weights, _DESCRIPTION: np.array(json.dumps(description))}
+        np.savez_compressed(file, **arrays)
+
+
+def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
+    """
+    :param path: of a file of :func:`save_policy`
+    :return: a policy that plays as the model did (of half precision: nearly so), whose critic is no one's; and the config of
+        its run
+    """
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        config = json.loads(str(arrays.pop(_DESCRIPTION)))
+        spaces = [space_from_json(config.pop(name)) for name in ("observation_space", "action_space")]
+    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        raise RuntimeError(f"{path}: is not a policy of sb3-offline benchmark --policies ({error})") from error
+    kwargs = {key: config[key] for key in ("policy", "policy_kwargs") if key in config}
+    model = create_model(config["algo"], kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))
+    model.actor.load_state_dict({name: th.as_tensor(array) for name, array in arrays.items()})
+    return model.policy, config

@@ -1,0 +1,76 @@
+"""Methods compared over all tasks, with rliable: interquartile means and probabilities of improvement."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rliable import library, metrics
+
+from sb3_offline.report.results import Results
+
+REPETITIONS = 1000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    :param value: the estimate
+    :param interval: 95 %, by a bootstrap over seeds within each task; ``None`` where there is only one seed
+    """
+
+    value: float
+    interval: tuple[float, float] | None
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f}" + (f" ({self.interval[0]:.2f} to {self.interval[1]:.2f})" if self.interval else "")
+
+
+def scores(results: Results) -> dict[str, np.ndarray]:
+    """
+    :param results: ours
+    :return: success rates of each method that has been run on all tasks, ``(seeds, tasks)``
+    """
+    return {
+        method: np.array([[results.cells[method, task].by("seed")[seed].rate for task in results.tasks] for seed in seeds])
+        for method in results.methods
+        if (seeds := results.seeds(method))
+    }
+
+
+def interquartile_means(results: Results) -> dict[str, Estimate]:
+    """
+    :param results: ours
+    :return: of each method the mean of the middle half of its runs, over seeds and tasks
+    """
+    own = scores(results)
+    return _estimates(own, lambda rates: np.array([metrics.aggregate_iqm(rates)]), own)
+
+
+def improvement_probabilities(results: Results, reference: str) -> dict[str, Estimate]:
+    """
+    :param results: ours
+    :param reference: a method
+    :return: of each other method, how probable it is that a run of the reference does better on a task, over all tasks
+    """
+    own = scores(results)
+    pairs = {other: (own[reference], own[other]) for other in own if other != reference and reference in own}
+    return _estimates(pairs, metrics.probability_of_improvement, own)
+
+
+def _estimates(samples: dict[str, Any], statistic: Callable[..., Any], own: dict[str, np.ndarray]) -> dict[str, Estimate]:
+    if not samples:
+        return {}
+    state = np.random.get_state()
+    np.random.seed(0)  # rliable draws from NumPy's global generator; a report comes out the same each time
+    try:
+        points, intervals = library.get_interval_estimates(samples, statistic, reps=REPETITIONS)
+    finally:
+        np.random.set_state(state)
+    found = {}
+    for name in samples:
+        low, high = np.ravel(intervals[name])
+        parts = samples[name] if isinstance(samples[name], tuple) else (own[name],)
+        several = all(len(part) > 1 for part in parts)  # of one seed, nothing can be drawn anew
+        found[name] = Estimate(float(np.ravel(points[name])[0]), (float(low), float(high)) if several else None)
+    return found

@@ -1,0 +1,114 @@
+"""One Markdown file with everything that CSV files and runs say."""
+
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+from sb3_offline.report import figures
+from sb3_offline.report.aggregates import REPETITIONS, improvement_probabilities, interquartile_means
+from sb3_offline.report.episodes import PlayedEpisode, play_finals
+from sb3_offline.report.results import FAILED, Results, comparison_table, paper_rates, read_results
+
+
+def write_report(
+    tables: Sequence[Path], output: Path, runs: Sequence[Path] = (), reference: str = "ceborl", notes: Path | None = None
+) -> Iterator[str]:
+    """
+    :param tables: CSV files of ``sb3-offline benchmark``
+    :param output: folder for ``report.md`` and its figures
+    :param runs: folder of the runs of each table, for film strips and values; or none
+    :param reference: the method that others are compared with
+    :param notes: a Markdown file to begin with: what the numbers cannot say, such as how hyperparameters were chosen
+    :return: what to tell the user, when it happens
+    """
+    if runs and len(runs) != len(tables):
+        raise RuntimeError(f"There are {len(tables)} tables and {len(runs)} folders of runs; give one each, or no folder")
+    parts = ["# Report", *([notes.read_text().strip()] if notes else [])]
+    output.mkdir(parents=True, exist_ok=True)
+    for table, folder in zip_longest(tables, runs):
+        results = read_results(table)
+        yield f"{table}: {len(results.cells)} cells"
+        parts += _section(results, output, reference)
+        if folder is not None:
+            yield f"Playing the final policies in {folder}"
+            parts += _episodes(results, folder, output)
+    (output / "report.md").write_text("\n\n".join(parts) + "\n")
+    yield f"Report: {output / 'report.md'}"
+
+
+def _section(results: Results, output: Path, reference: str) -> list[str]:
+    figures.plot_table(results, output / f"{results.name}.png")
+    figures.plot_curves(results, output / f"{results.name}_curves.png")
+    steps = sorted({int(row["step"]) for row in results.rows})
+    return [
+        f"## {results.name}",
+        f"Success rates of the checkpoints at steps {', '.join(map(str, steps))}; no checkpoint was chosen. In brackets "
+        "Wilson's 95 % intervals, as if all episodes were independent; those of one seed share a policy, so seeds tell more. "
+        "The paper's numbers are from its Table 1: three seeds, 500,000 steps, from pictures, on its own data.",
+        comparison_table(results),
+        _ranking(results),
+        *_failures(results),
+        f"![Success rates by task, beside the paper's]({results.name}.png)",
+        "### Over all tasks",
+        _aggregates(results, reference),
+        "### Over the checkpoints",
+        f"![Success rate at each checkpoint]({results.name}_curves.png)",
+    ]
+
+
+def _ranking(results: Results) -> str:
+    paper = paper_rates()
+    order = "; ".join(
+        f"{method} {mean:.2f}" + (f" (paper {paper[method, 'all']:.2f})" if (method, "all") in paper else "")
+        for method, mean in results.means.items()
+    )
+    unfinished = [method for method in results.methods if method not in results.means]
+    rest = f" Not on all tasks yet: {', '.join(unfinished)}." if unfinished else ""
+    return f"By the mean over the tasks: {order or 'none is complete'}.{rest}"
+
+
+def _failures(results: Results) -> list[str]:
+    names = ("method", "task", "seed", "config")
+    failed = sorted({tuple(row[name] for name in names) for row in results.rows if FAILED in row["config"]})
+    lines = [f"- {method}, {task}, seed {seed}: {config.partition(FAILED)[2][:-1]}" for method, task, seed, config in failed]
+    about = "Runs that broke off; the checkpoints that they never reached count as failures:"
+    return [about, "\n".join(lines)] if failed else []
+
+
+def _aggregates(results: Results, reference: str) -> str:
+    means, better = interquartile_means(results), improvement_probabilities(results, reference)
+    lines = [f"| method | seeds | interquartile mean | P({reference} does better) |", "|---" * 4 + "|"]
+    for method, mean in means.items():
+        lines.append(f"| {method} | {len(results.seeds(method))} | {mean} | {better.get(method, '')} |")
+    about = (
+        "The interquartile mean is that of the middle half of all runs, over tasks and seeds. The probability is that of a "
+        f"run of {reference} beating one of the other method on the same task, ties counting half, averaged over the tasks. "
+        f"In brackets 95 % intervals from {REPETITIONS} bootstrap samples of the seeds, within each task (rliable); one seed "
+        "gives none. Methods that have not been run on all tasks are left out."
+    )
+    return "\n".join([*lines, "", about])
+
+
+def _episodes(results: Results, runs: Path, output: Path) -> list[str]:
+    played: dict[tuple[str, str], PlayedEpisode] = {
+        (method, task): episode for method, task, episode in play_finals(results, runs)
+    }
+    if not played:
+        raise RuntimeError(f"{runs}: holds none of the runs of {results.name}; name the folder that was given as --runs")
+    parts = ["### The policies at play", "The first episode of the last evaluation, of the first seed, whatever came of it."]
+    for task in results.tasks:
+        episodes = {method: played[method, task] for method in results.methods if (method, task) in played}
+        if episodes:
+            file = f"{results.name}_{task}.png"
+            figures.plot_strips(episodes, task, output / file)
+            parts.append(f"![{task}: frames of an episode of each method]({file})")
+    if any(episode.values for episode in played.values()):
+        file = f"{results.name}_values.png"
+        figures.plot_values(played, output / file)
+        parts += [
+            "### Values along these episodes",
+            "What the lower of the critics makes of each state and action: the probability of success C, or Q. Green: the "
+            "episode was solved, at the dotted line.",
+            f"![Values along the episodes]({file})",
+        ]
+    return parts
