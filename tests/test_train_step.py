@@ -75,7 +75,8 @@ def recursive(f, weight):
     return (weight * softplus(-f) + softplus(f)).mean(axis=-1).sum()
 
 
-def test_default_form(dataset, monkeypatch):
+@pytest.mark.parametrize("advantage", ["return", "value"])
+def test_default_form(dataset, monkeypatch, advantage):
     n_steps, beta, prior, share, temperature, floor, weight_max, exponent = 3, 0.2, 0.5, 0.1, 0.5, 0.05, 1.2, 0.7
     model = CEBORL(
         "MlpPolicy",
@@ -91,6 +92,7 @@ def test_default_form(dataset, monkeypatch):
         advantage_floor=floor,
         weight_max=weight_max,
         state_exponent=exponent,
+        advantage=advantage,
         initial_odds=0.5,
         n_action_samples=5,
         seed=0,
@@ -115,7 +117,8 @@ def test_default_form(dataset, monkeypatch):
     state += share * recursive(v_examples, example_weight)
 
     eps = floor * np.exp(f_examples.min(axis=0)).mean()
-    weights = ((np.exp(f.min(axis=0)) + eps) / (np.exp(v) + eps)) ** (1 / temperature)
+    odds = weight if advantage == "return" else np.exp(f.min(axis=0))
+    weights = ((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
     weights = np.minimum(weights, weight_max) * (np.exp(v) / (np.exp(v) + eps)) ** exponent
     monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n].numpy())

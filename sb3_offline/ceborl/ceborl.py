@@ -9,6 +9,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
 from sb3_offline.ceborl.losses import (
+    OVERFLOW,
     advantage_weights,
     conservative_penalty,
     example_loss,
@@ -37,6 +38,7 @@ _CHOICES = {
     "penalty_space": ("probability", "logit"),
     "backup": ("dataset", "policy", "expectile"),
     "policy_extraction": ("weighted", "maximize"),
+    "advantage": ("return", "value"),
 }
 
 #: Diagnostics that need extra forward passes are taken once in so many gradient steps.
@@ -85,6 +87,8 @@ class CEBORL(ExampleBasedAlgorithm):
     :param expectile: of ``backup="expectile"``: 0.5 is the mean, near 1 the best of the data's actions
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
         paper's Eq. 11
+    :param advantage: what the weights compare with the state's odds: ``"return"``: omega, to which the data's actions led within
+        the n-step window; ``"value"``: what the classifier says of the data's action
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
     :param advantage_floor: odds, as a share of the examples' odds, under which advantages are noise and count little
     :param weight_max: bound of the advantage weights
@@ -127,11 +131,12 @@ class CEBORL(ExampleBasedAlgorithm):
         backup: str = "dataset",
         expectile: float = 0.9,
         policy_extraction: str = "weighted",
+        advantage: str = "return",
         temperature: float = 0.3,
         advantage_floor: float = 0.01,
         weight_max: float = 100.0,
         state_exponent: float = 2.0,
-        policy_batches: int = 64,
+        policy_batches: int = 512,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int = 4,
@@ -176,6 +181,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.backup = backup
         self.expectile = expectile
         self.policy_extraction = policy_extraction
+        self.advantage = advantage
         self.temperature = temperature
         self.advantage_floor = advantage_floor
         self.weight_max = weight_max
@@ -242,8 +248,9 @@ class CEBORL(ExampleBasedAlgorithm):
             self._optimize(self.critic.optimizer, critic_loss)
 
             if self.policy_extraction == "weighted":
+                outcome = discounted_omega if self.advantage == "return" else success_odds(data_logits.detach(), OVERFLOW)
                 weights = advantage_weights(
-                    data_logits.detach(),
+                    outcome,
                     state_logits.squeeze(0).detach(),
                     example_logits.detach(),
                     self.temperature,

@@ -76,7 +76,7 @@ def recursive_loss(data_logits: th.Tensor, discounted_omega: th.Tensor) -> th.Te
 
 
 def advantage_weights(
-    data_logits: th.Tensor,
+    odds: th.Tensor,
     state_logits: th.Tensor,
     example_logits: th.Tensor,
     temperature: float,
@@ -85,7 +85,7 @@ def advantage_weights(
     state_exponent: float = 0.0,
 ) -> th.Tensor:
     """
-    How much more the data's action promises than the data's actions do on average in its state, times how surely that state
+    How much more comes of the data's action than of the data's actions on average in its state, times how surely that state
     promises anything: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) **
     state_exponent``.
 
@@ -93,7 +93,7 @@ def advantage_weights(
     odds. Where both odds are far under it, their ratio is noise, the first factor is about 1, and the second is small; where
     they are above it, the second is about 1: the way to success counts as much as its end.
 
-    :param data_logits: logits of dataset actions, ``(n_critics, batch)``
+    :param odds: what comes of dataset actions: learned odds, or the target that they are learned from, ``(batch,)``
     :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
     :param example_logits: logits of success examples, ``(n_critics, batch)``; the scale of the odds
     :param temperature: the smaller, the sharper
@@ -102,7 +102,6 @@ def advantage_weights(
     :param state_exponent: how much less states count that promise little; 0: all states count alike
     :return: ``(batch,)``
     """
-    odds = success_odds(data_logits, OVERFLOW)
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
     example_odds = success_odds(example_logits, OVERFLOW).mean()
     eps = advantage_floor * example_odds
