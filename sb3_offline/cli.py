@@ -109,8 +109,8 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument("--env", default=ENV_ID)
     parser.add_argument("--task", help="of the multimodal environment, e.g. door-open")
     parser.add_argument("--config", help="a shipped config's name or a YAML file (default: the algorithm's)")
-    parser.add_argument("--dataset", nargs="+", required=True, help="dataset files or patterns")
-    parser.add_argument("--examples", help="folder of pictures, .npz or HDF5 file")
+    parser.add_argument("--dataset", nargs="+", help="dataset files or patterns (default: the config's)")
+    parser.add_argument("--examples", help="folder of pictures, .npz or HDF5 file (default: the config's)")
     parser.add_argument("-n", "--n-timesteps", type=int, help="gradient steps (default: the config's)")
     parser.add_argument("--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="overwrite the config's")
     parser.add_argument("--seed", type=int, default=0)
@@ -132,7 +132,7 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
             args.env,
             config,
             args.output,
-            dataset=args.dataset if len(args.dataset) > 1 else args.dataset[0],
+            dataset=args.dataset[0] if args.dataset and len(args.dataset) == 1 else args.dataset,
             examples=args.examples,
             env_kwargs={"task": args.task} if args.task else {},
             seed=args.seed,

@@ -113,11 +113,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._metrics: dict[str, tuple[th.Tensor, int]] = {}
 
     def _setup_model(self) -> None:
+        if not hasattr(self, "observation_space"):
+            raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is None:
-            if not hasattr(self, "observation_space"):
-                raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
             self.env = self._wrap_env(SpacesOnlyEnv(self.observation_space, self.action_space))
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         self.policy = self.policy.to(self.device)

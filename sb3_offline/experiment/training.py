@@ -15,8 +15,7 @@ import sb3_offline
 from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
-from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data.selection import select_episodes
+from sb3_offline.experiment.data import resolve_data
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success
 
 EVALUATION_FIELDS = ("step", "episodes", "successes", "mean_return")
@@ -145,7 +144,7 @@ def find_algorithm(name: str) -> type[OfflineAlgorithm]:
 def create_model(
     algo: str,
     config: dict[str, Any],
-    dataset: Any,
+    dataset: Any = None,
     examples: Any = None,
     seed: int = 0,
     **kwargs: Any,
@@ -153,8 +152,8 @@ def create_model(
     """
     :param algo: name in :data:`sb3_offline.ALGOS`
     :param config: as :func:`~sb3_offline.experiment.config.load_config` returns it
-    :param dataset: dataset path(s)
-    :param examples: success examples, for the algorithms that learn from them
+    :param dataset: dataset path(s) (default: the config's)
+    :param examples: success examples, for the algorithms that learn from them (default: the config's)
     :param seed: of the run
     :param kwargs: further constructor arguments
     :return: a model, not trained
@@ -164,35 +163,17 @@ def create_model(
     try:
         return find_algorithm(algo)(**arguments)
     except TypeError as error:
-        raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams and --examples") from error
+        raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams, --dataset and --examples") from error
 
 
 def _data_arguments(config: dict[str, Any], dataset: Any, examples: Any) -> dict[str, Any]:
     """:return: arguments of a model's constructor, and of ``load``, that say what it learns from"""
-    if "episodes" in config:
-        dataset = choose_data(dataset, config["episodes"], config.get("env_kwargs", {}))
-    return {"dataset": dataset} if examples is None else {"dataset": dataset, "examples": examples}
+    resolved = resolve_data({**config, **_given(dataset, examples)}, config.get("env_kwargs", {}))
+    return {key: resolved[key] for key in ("dataset", "examples") if key in resolved}
 
 
-def choose_data(dataset: Any, episodes: dict[str, Any], env_kwargs: dict[str, Any]) -> list[OfflineDataset]:
-    """
-    :param dataset: dataset path(s)
-    :param episodes: arguments of :func:`~sb3_offline.data.selection.select_episodes`; ``{name}`` in a text stands for the
-        environment's keyword argument of that name, so that ``source: "{task}"`` serves all tasks
-    :param env_kwargs: of the environment
-    :return: the datasets with these episodes alone
-    """
-    try:
-        filled: dict[str, Any] = {
-            key: text.format(**env_kwargs) if isinstance(text, str) else text for key, text in episodes.items()
-        }
-        return select_episodes(dataset, **filled)
-    except KeyError as error:
-        raise RuntimeError(
-            f"The config's `episodes` names {error}, which the environment is not given: add it (--task)"
-        ) from error
-    except (AttributeError, TypeError) as error:
-        raise RuntimeError(f"The config's `episodes` is {episodes!r}; give it `source` and `success` ({error})") from error
+def _given(dataset: Any, examples: Any) -> dict[str, Any]:
+    return {key: value for key, value in (("dataset", dataset), ("examples", examples)) if value is not None}
 
 
 def train(
@@ -201,7 +182,7 @@ def train(
     config: dict[str, Any],
     output: Path,
     *,
-    dataset: Any,
+    dataset: Any = None,
     examples: Any = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
@@ -219,8 +200,8 @@ def train(
     :param env_id: environment to evaluate in
     :param config: as :func:`~sb3_offline.experiment.config.load_config` returns it
     :param output: folder, created
-    :param dataset: dataset path(s)
-    :param examples: success examples, for the algorithms that learn from them
+    :param dataset: dataset path(s) (default: the config's)
+    :param examples: success examples, for the algorithms that learn from them (default: the config's)
     :param env_kwargs: added to the config's
     :param seed: of the run
     :param eval_freq: gradient steps between evaluations (0: none)
@@ -271,7 +252,7 @@ def run_record(
     env_id: str,
     config: dict[str, Any],
     *,
-    dataset: Any,
+    dataset: Any = None,
     examples: Any = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
@@ -279,9 +260,7 @@ def run_record(
 ) -> dict[str, Any]:
     """:return: what :func:`train`, with these arguments, writes into ``config.yml``"""
     all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
-    record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, "dataset": dataset}
-    if examples is not None:
-        record["examples"] = examples
+    record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, **_given(dataset, examples)}
     # Through JSON: paths and NumPy numbers become what a YAML file can hold.
     return json.loads(json.dumps(record, default=str))
 

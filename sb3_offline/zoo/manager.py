@@ -1,0 +1,67 @@
+"""The one place where a run of rl_zoo3 differs for offline algorithms: what its config means."""
+
+import argparse
+from typing import Any
+
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+import sb3_offline
+from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
+from sb3_offline.data.examples import load_examples
+from sb3_offline.data.reader import open_datasets
+from sb3_offline.experiment.config import config_path
+from sb3_offline.experiment.data import resolve_data
+
+
+class OfflineExperimentManager(ExperimentManager):
+    """
+    ``rl_zoo3``'s experiment manager, for the configs of this package as well:
+
+    - The config of an offline algorithm is by default the shipped one; ``config`` may be the name of another shipped one.
+    - ``dataset``, ``examples`` and ``episodes`` of a config mean what they mean to ``sb3-offline train``, and what is wrong
+      with them is said before a run begins.
+    - The ``env_kwargs`` that were given are added to the config's, in place of replacing them all, and the environment of the
+      evaluations has them too.
+
+    :param args: parsed arguments of the program; its ``env_kwargs`` become the ones that are used, for ``enjoy``
+    :param algo: name of the algorithm
+    :param rest: see ``rl_zoo3``
+    :param config: YAML file, Python file or package of hyperparameters, or name of a shipped config
+    :param kwargs: see ``rl_zoo3``
+    """
+
+    def __init__(self, args: argparse.Namespace, algo: str, *rest: Any, config: str | None = None, **kwargs: Any):
+        if algo in sb3_offline.ALGOS and config_path(config or algo).is_file():
+            config = str(config_path(config or algo))
+        super().__init__(args, algo, *rest, config=config, **kwargs)
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        given, self.env_kwargs = self.env_kwargs, {}
+        hyperparams, saved_hyperparams = super().read_hyperparameters()
+        env_kwargs = {**hyperparams.get("env_kwargs", {}), **given}
+        hyperparams["env_kwargs"] = saved_hyperparams["env_kwargs"] = self.args.env_kwargs = env_kwargs
+        self.eval_env_kwargs = {**env_kwargs, **(self._eval_env_kwargs_args or {})}
+        return hyperparams, saved_hyperparams
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
+        if self.algo in sb3_offline.ALGOS:
+            hyperparams = resolve_data(hyperparams, hyperparams["env_kwargs"])
+            if hyperparams.get("dataset") is None:
+                remedy = "add `dataset:` to it, or give --hyperparams \"dataset:'my_data.h5'\""
+                raise RuntimeError(f"{self.config}: names no dataset for {self.env_name.gym_id}; {remedy}")
+            datasets = open_datasets(hyperparams["dataset"])
+            if hyperparams.get("examples") is not None:
+                load_examples(hyperparams["examples"], datasets[0].observation_space)
+        return super()._preprocess_hyperparams(hyperparams)
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        try:
+            return super().setup_experiment()
+        except TypeError as error:
+            raise RuntimeError(f"{self.algo}: {error}; check the config and --hyperparams") from error
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        if isinstance(model, CEBORL):
+            self.callbacks.append(DiagnosticsCallback())
+        super().learn(model)
