@@ -142,7 +142,8 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
     slice_seed = int(np.random.SeedSequence((seed, index, step)).generate_state(1)[0] >> 1)
     if curve:
         state = folder / f"state_{step}"
-        with warnings.catch_warnings():  # SB3 fears for the n-step returns of the buffer that it makes: the next line replaces it
+        # SB3 warns of the n-step returns of a buffer that it makes here, which is replaced at once
+        with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`n_steps=")
             model = SAC.load(state / "model.zip", env=env, device="cpu")
         model.load_replay_buffer(state / "replay_buffer.pkl")

@@ -87,13 +87,13 @@ class CEBORL(ExampleBasedAlgorithm):
     :param expectile: of ``backup="expectile"``: 0.5 is the mean, near 1 the best of the data's actions
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
         paper's Eq. 11
-    :param advantage: what the weights compare with the state's odds: ``"return"``: omega, to which the data's actions led within
-        the n-step window; ``"value"``: what the classifier says of the data's action
+    :param advantage: what the weights compare with the state's odds: ``"return"``: omega, to which the data's actions led
+        within the n-step window; ``"value"``: what the classifier says of the data's action
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
     :param advantage_floor: odds, as a share of the examples' odds, under which advantages are noise and count little
     :param weight_max: bound of the advantage weights
-    :param state_exponent: states whose odds are under the floor count less, by this power. Advantages say which action is better in
-        a state; most states of a mixed dataset lead nowhere, and what is best there matters little.
+    :param state_exponent: states whose odds are under the floor count less, by this power. Advantages say which action is
+        better in a state; most states of a mixed dataset lead nowhere, and what is best there matters little.
     :param policy_batches: the policy learns from the transitions of the last so many batches, drawn by their weights
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps

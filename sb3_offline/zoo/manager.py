@@ -34,7 +34,7 @@ class OfflineExperimentManager(ExperimentManager):
     def __init__(self, args: argparse.Namespace, algo: str, *rest: Any, config: str | None = None, **kwargs: Any):
         if algo in sb3_offline.ALGOS and config_path(config or algo).is_file():
             config = str(config_path(config or algo))
-        super().__init__(args, algo, *rest, config=config, **kwargs)
+        super().__init__(args, algo, *rest, config=config, **kwargs)  # type: ignore[misc]
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         given, self.env_kwargs = self.env_kwargs, {}
