@@ -62,6 +62,9 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "standard deviations without a floor": {"policy_kwargs": {"features_extractor_kwargs": {"std_min": 1e-3}}},
     },
     "policy": {
+        "weighted by the classifier's odds": {"advantage": "value"},
+        "all states count alike": {"state_exponent": 0.0},
+        "64 batches for the policy": {"policy_batches": 64},
         "policy maximises C": {"policy_extraction": "maximize"},
         "temperature 0.1": {"temperature": 0.1},
         "temperature 1": {"temperature": 1.0},
