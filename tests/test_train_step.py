@@ -171,6 +171,19 @@ def test_rce_is_the_paper_form_without_the_penalty(dataset):
     assert {name: getattr(model, name) for name in PAPER_FORM} == {**PAPER_FORM, "beta": 0.0}
 
 
+def test_densities_of_actions_are_those_of_sb3(dataset):
+    actor = BC("MlpPolicy", None, dataset / "states.h5", policy_kwargs=SMALL).actor
+    features = th.randn(6, 3)
+    mean, log_std = actor.gaussian_parameters(features)
+    for n_samples in (None, 5):
+        actions, log_prob = actor.sample(features, n_samples)
+        for k in range(n_samples or 1):
+            own = (actions, log_prob) if n_samples is None else (actions[:, k], log_prob[:, k])
+            distribution = actor.action_dist.proba_distribution(mean, log_std)
+            th.testing.assert_close(own[1], distribution.log_prob(own[0]), rtol=1e-3, atol=1e-3)
+            th.testing.assert_close(own[1], actor.log_prob(features, own[0]), rtol=1e-3, atol=1e-3)
+
+
 def test_bc_maximises_the_likelihood(dataset):
     model = BC("MlpPolicy", None, dataset / "states.h5", loss="log_prob", learning_rate=1e-2, policy_kwargs=SMALL, seed=0)
     batch = model.replay_buffer.sample(64)

@@ -223,12 +223,15 @@ class CEBORL(ExampleBasedAlgorithm):
                 example_omega = self._example_omega(examples, example_rows, example_actions)
 
             # Eq. 10
-            parts = [len(features), len(example_features)]
             both_features = th.cat([features, example_features])
-            both_logits = self.critic.values(both_features, th.cat([batch.actions, example_actions]))
-            data_logits, example_logits = both_logits.split(parts, dim=1)
-            term_c = recursive_loss(data_logits, discounted_omega)
-            term_b = self._example_term(example_logits, example_omega)
+            logits = self.critic.values(both_features, th.cat([batch.actions, example_actions]))
+            data_logits, example_logits = logits[:, : len(features)], logits[:, len(features) :]
+            if self.policy_extraction == "weighted" and self.backup != "expectile":
+                # One more critic, of the state without the action: its odds are the mean over the data's actions.
+                logits = th.cat([logits, self.critic.state_values(both_features).unsqueeze(0)])
+                state_logits = logits[-1, : len(features)]
+            term_c = recursive_loss(logits[:, : len(features)], discounted_omega)
+            term_b = self._example_term(logits[:, len(features) :], example_omega)
             critic_loss = term_c + term_b
             if self.beta > 0:
                 sampled_logits = self.critic.values(features, self._sample_penalized_actions(policy_features))
@@ -236,22 +239,17 @@ class CEBORL(ExampleBasedAlgorithm):
                 critic_loss = critic_loss + self.beta * term_a
                 self._record(penalty=term_a, classifier_penalized=sampled_logits.sigmoid().mean())
             if self.backup == "expectile":
-                state_logits = self.critic.state_values(features).unsqueeze(0)
+                state_logits = self.critic.state_values(features)
                 with th.no_grad():
                     target_logits = self.critic_target.values(self.critic_target.encode(observations), batch.actions)
-                critic_loss = critic_loss + expectile_loss(target_logits.amin(dim=0) - state_logits.squeeze(0), self.expectile)
-            elif self.policy_extraction == "weighted":
-                # The same classification without the action: its odds are the mean over the data's actions.
-                state_logits, example_state_logits = self.critic.state_values(both_features).unsqueeze(0).split(parts, dim=1)
-                critic_loss = critic_loss + recursive_loss(state_logits, discounted_omega)
-                critic_loss = critic_loss + self._example_term(example_state_logits, example_omega)
+                critic_loss = critic_loss + expectile_loss(target_logits.amin(dim=0) - state_logits, self.expectile)
             self._optimize(self.critic.optimizer, critic_loss)
 
             if self.policy_extraction == "weighted":
                 outcome = discounted_omega if self.advantage == "return" else success_odds(data_logits.detach(), OVERFLOW)
                 weights = advantage_weights(
                     outcome,
-                    state_logits.squeeze(0).detach(),
+                    state_logits.detach(),
                     example_logits.detach(),
                     self.temperature,
                     self.advantage_floor,

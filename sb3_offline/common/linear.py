@@ -127,24 +127,20 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th
     return _run(x, (False,), (weight, bias))
 
 
-def run_layers(
-    layers: Sequence[nn.Module], x: th.Tensor, first: tuple[th.Tensor, th.Tensor | None] | None = None
-) -> th.Tensor:
+def run_layers(layers: Sequence[nn.Module | tuple[th.Tensor, th.Tensor | None]], x: th.Tensor) -> th.Tensor:
     """
     What ``nn.Sequential(*layers)`` does.
 
-    :param layers: linear layers and whatever stands between them
+    :param layers: linear layers, as modules or as weight and bias as :func:`linear` takes them, and whatever stands between
     :param x: ``(rows, in_features)``; its dtype is that of the products
-    :param first: weight and bias in place of those of the first layer, as :func:`linear` takes them
     :return: ``(rows, out_features)``
     """
     relus: list[bool] = []
     parameters: list[th.Tensor | None] = []
     for layer in layers:
-        if isinstance(layer, nn.Linear):
+        if isinstance(layer, nn.Linear | tuple):
             relus.append(False)
-            parameters += (layer.weight, layer.bias) if first is None else first
-            first = None
+            parameters += layer if isinstance(layer, tuple) else (layer.weight, layer.bias)
         elif type(layer) is nn.ReLU and relus and not relus[-1]:
             relus[-1] = True
         else:
