@@ -13,6 +13,7 @@ extensions = [
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build"]
+html_extra_path = ["pages"]  # made by `sb3-offline inspect --html`
 nitpicky = False  # types of SB3, torch and gymnasium are not looked up: the build needs no network
 
 # Formulas in dollars, and an anchor for each heading down to the third level.

@@ -202,7 +202,7 @@ class OfflineCritic(ContinuousCritic):
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
             of_state = linear(features, state_weight, q_net[0].bias)
-            layers = [(action_weight, of_state), *list(q_net)[1:]]
+            layers: list[Any] = [(action_weight, of_state), *list(q_net)[1:]]
             outputs.append(run_layers(layers, samples.flatten(0, 1)).view(samples.shape[:2]))
         return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
