@@ -193,7 +193,7 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
         from sb3_offline.benchmark.runner import export_policies, run_grid
 
         train: Callable | None = None
-        if args.ray_address:
+        if args.ray_address and not args.no_training:
             from sb3_offline.benchmark.on_ray import train_on_ray
 
             train = functools.partial(train_on_ray, address=args.ray_address)

@@ -45,7 +45,8 @@ def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
                 if process.exitcode != _IN_USE and kills[run.label] < MOST_KILLS:
                     waiting.appendleft(run)
                 else:
-                    left.append(f"{run.label} ({'another process is at it' if process.exitcode == _IN_USE else 'killed'})")
+                    reason = "another process is at it" if process.exitcode == _IN_USE else "its process was killed"
+                    left.append(f"{run.label} ({reason})")
     finally:
         for process, _ in working.values():
             process.terminate()
