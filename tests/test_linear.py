@@ -10,6 +10,7 @@ from torch import nn
 
 from sb3_offline.common.linear import linear, run_layers
 from sb3_offline.common.policies import CnnPolicy, MlpPolicy
+from sb3_offline.td3_bc.policies import TD3BCPolicy
 
 # bfloat16 has 8 significant bits; a gradient adds thousands of such roundings up, of either sign.
 TOLERANCE = {th.float64: 1e-12, th.float32: 1e-4, th.bfloat16: 0.04}
@@ -88,11 +89,25 @@ def test_pictures_may_come_as_bytes(mixed_precision):
     assert distance(gradients(policy.critic), gradients(plain)) < 3 * tolerance
 
 
-def test_what_plays_is_computed_in_full_precision():
+@pytest.mark.parametrize("policy_class", [MlpPolicy, TD3BCPolicy])
+def test_what_plays_is_computed_in_full_precision(policy_class):
     space = spaces.Box(-1, 1, (9,), np.float32)
-    policy = MlpPolicy(space, ACTIONS, lambda _: 1e-3, mixed_precision=True)
-    plain = copy.deepcopy(policy).double()
-    observation = np.linspace(-1, 1, 9, dtype=np.float32)
+    policy = policy_class(space, ACTIONS, lambda _: 1e-3, mixed_precision=True)
+    actor, observation = copy.deepcopy(policy.actor).double(), np.linspace(-1, 1, 9, dtype=np.float32)
     action, _ = policy.predict(observation, deterministic=True)
-    expected = th.tanh(plain.actor.mu(plain.actor.latent_pi(th.as_tensor(observation).double())))
-    np.testing.assert_allclose(action, expected.detach().numpy(), atol=1e-6)
+    layers = actor.mu if policy_class is TD3BCPolicy else th.nn.Sequential(actor.latent_pi, actor.mu, th.nn.Tanh())
+    np.testing.assert_allclose(action, layers(th.as_tensor(observation).double()).detach().numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("mixed_precision", [False, True])
+def test_deterministic_actors_learn_in_the_precision_of_the_critics(mixed_precision):
+    policy = TD3BCPolicy(spaces.Box(-1, 1, (9,), np.float32), ACTIONS, lambda _: 1e-3, mixed_precision=mixed_precision)
+    observations, plain = th.randn(32, 9), copy.deepcopy(policy.actor).double()
+    features = policy.actor.encode(observations)
+    assert features.dtype == (th.bfloat16 if mixed_precision else th.float32)
+    actions, expected = policy.actor.act(features), plain.mu(observations.double())
+    tolerance = TOLERANCE[th.bfloat16 if mixed_precision else th.float32]
+    assert actions.dtype == th.float32 and distance(actions, expected) < tolerance
+    actions.pow(2).mean().backward()
+    expected.pow(2).mean().backward()
+    assert distance(gradients(policy.actor), gradients(plain)) < 3 * tolerance

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -30,25 +30,22 @@ ACTION_LIMIT = 0.999
 SQUASHING_EPSILON = 1e-6
 
 
-class OfflineActor(Actor):
+class EncodingActor(BasePolicy):
     """
-    Tanh-Gaussian actor (policy) that can also score given actions.
+    What actors share whose encoder may be the critic's: features to learn from.
 
-    :param std_min: floor of the standard deviation *before* the tanh squashing. A positive floor keeps the likelihood of
-        dataset actions bounded.
+    :param args: see :class:`stable_baselines3.common.policies.BasePolicy`
     :param detach_encoder: whether the encoder belongs to the critic, so that no gradient of the actor reaches it
-    :param kwargs: see :class:`stable_baselines3.sac.policies.Actor`
+    :param kwargs: see :class:`stable_baselines3.common.policies.BasePolicy`
     """
 
-    def __init__(self, *args: Any, std_min: float = 0.0, detach_encoder: bool = True, **kwargs: Any):
+    def __init__(self, *args: Any, detach_encoder: bool = True, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.std_min = std_min
         self.detach_encoder = detach_encoder
         self.mixed_precision: bool | None = False
-        self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "std_min": self.std_min, "detach_encoder": self.detach_encoder}
+        return {**super()._get_constructor_parameters(), "detach_encoder": self.detach_encoder}
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -58,6 +55,25 @@ class OfflineActor(Actor):
         """
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
             return _encode(self, obs)
+
+
+class OfflineActor(EncodingActor, Actor):
+    """
+    Tanh-Gaussian actor (policy) that can also score given actions.
+
+    :param args: see :class:`stable_baselines3.sac.policies.Actor`
+    :param std_min: floor of the standard deviation *before* the tanh squashing. A positive floor keeps the likelihood of
+        dataset actions bounded.
+    :param kwargs: see :class:`EncodingActor` and :class:`stable_baselines3.sac.policies.Actor`
+    """
+
+    def __init__(self, *args: Any, std_min: float = 0.0, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.std_min = std_min
+        self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "std_min": self.std_min}
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         # What plays is computed in full precision, whatever learning is.
@@ -223,7 +239,7 @@ class OfflineCritic(ContinuousCritic):
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
 
 
-def _encode(module: OfflineActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
+def _encode(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
     """Features of observations; all that is computed from them keeps their dtype, so it is chosen here."""
     encoder, device = module.features_extractor, module.device
     bfloat16 = has_fast_bfloat16(device) if module.mixed_precision is None else module.mixed_precision

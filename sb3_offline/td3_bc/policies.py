@@ -1,49 +1,33 @@
 """Policies with a deterministic actor and a target of it."""
 
-from typing import Any
-
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor
 
-from sb3_offline.common.policies import OfflinePolicy
+from sb3_offline.common.linear import run_layers
+from sb3_offline.common.policies import EncodingActor, OfflinePolicy
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor
 
 
-class DeterministicActor(Actor):
+class DeterministicActor(EncodingActor, Actor):
     """
     SB3's actor of TD3, whose encoder may be the critic's.
 
-    :param detach_encoder: whether the encoder belongs to the critic, so that no gradient of the actor reaches it
-    :param kwargs: see :class:`stable_baselines3.td3.policies.Actor`
+    :param args: see :class:`stable_baselines3.td3.policies.Actor`
+    :param kwargs: see :class:`~sb3_offline.common.policies.EncodingActor` and :class:`stable_baselines3.td3.policies.Actor`
     """
-
-    def __init__(self, *args: Any, detach_encoder: bool = True, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.detach_encoder = detach_encoder
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "detach_encoder": self.detach_encoder}
-
-    def encode(self, obs: PyTorchObs) -> th.Tensor:
-        """
-        :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
-        :return: features, ``(batch, features_dim)``, cut from the graph where the encoder is the critic's
-        """
-        with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
-            return self.extract_features(obs, self.features_extractor)
 
     def act(self, features: th.Tensor) -> th.Tensor:
         """
-        :param features: ``(batch, features_dim)``
+        :param features: ``(batch, features_dim)``; the products are computed in their dtype
         :return: actions in [-1, 1], ``(batch, action_dim)``
         """
-        weight = next(self.mu.parameters())
-        return self.mu(features.to(weight.dtype))  # the critic's may come in the lower precision that it learns in
+        *layers, squash = self.mu
+        return squash(run_layers(layers, features).to(next(self.mu.parameters()).dtype))
 
-    def forward(self, obs: PyTorchObs, deterministic: bool = True) -> th.Tensor:  # type: ignore[override]
-        return self.act(self.encode(obs))
+    def forward(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
+        return super().forward(obs)  # what plays is computed in full precision, whatever learning is
 
 
 class TD3BCPolicy(OfflinePolicy):
@@ -66,7 +50,9 @@ class TD3BCPolicy(OfflinePolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DeterministicActor:  # type: ignore
         actor_kwargs = self._update_features_extractor(self.net_args, features_extractor)
-        return DeterministicActor(**actor_kwargs, detach_encoder=self.share_features_extractor).to(self.device)
+        actor = DeterministicActor(**actor_kwargs, detach_encoder=self.share_features_extractor)
+        actor.mixed_precision = self.mixed_precision
+        return actor.to(self.device)
 
 
 MlpPolicy = TD3BCPolicy
