@@ -255,8 +255,9 @@ def _improved_policy(
         best = logits >= logits.max(dim=1, keepdim=True).values - 1e-9
         return best / best.sum(dim=1, keepdim=True)
     example_logits = (policy[GOAL] * logits[GOAL].exp()).sum().log().view(1, 1)
+    # Of an action's outcomes, only the classifier's odds are a table: advantage="value"
     weights = losses.advantage_weights(
-        logits.view(1, -1),
+        logits.exp().flatten(),
         state_logits.repeat_interleave(N_ACTIONS),
         example_logits,
         variant.temperature,
