@@ -1,16 +1,18 @@
 """
-RCE and CEBORL on a point mass in the plane, whose data head for five goals alike; each task is told by 50 examples of one.
+Learners from examples on a point mass in the plane, whose data head for five goals alike; each task is told by 50 examples of
+one goal.
 
     python benchmarks/goals_point_mass.py
 
 Writes results/point_mass.csv: of the first three goals together, episodes solved by the policy's mode after each 500 gradient
-steps.
+steps. Variants that are in the file are not run again.
 """
 
 import argparse
 import csv
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -24,6 +26,33 @@ import point_mass  # noqa: E402
 
 N_GOALS, TASKS, STEPS, EVAL_FREQ, N_EPISODES = 5, (0, 1, 2), 2500, 500, 20
 ENV_ID = "TestPointMass-v0"
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "CEBORL": ("ceborl", {}),
+    "RCE": ("rce", {}),
+    "RCE, 10-step": ("rce", {"n_steps": 10}),
+    "ORIL": ("oril", {}),
+    "d-CQL": ("dcql", {}),
+}
+
+
+def successes(algo: str, change: dict[str, Any], goal: int, data: Path, seed: int) -> list[int]:
+    """:return: episodes solved after each EVAL_FREQ gradient steps"""
+    model = ALGOS[algo](
+        "MlpPolicy",
+        ENV_ID,
+        str(data),
+        examples=point_mass.goal_examples(goal=goal),
+        n_action_samples=4,
+        seed=seed,
+        device="cpu",
+        policy_kwargs={"net_arch": [64, 64]},
+        **change,
+    )
+    solved = []
+    for step in range(0, STEPS, EVAL_FREQ):
+        model.learn(EVAL_FREQ, log_interval=None, reset_num_timesteps=step == 0)
+        solved.append(sum(evaluate_success(model, ENV_ID, {"goal": goal}, N_EPISODES).successes))
+    return solved
 
 
 def main() -> None:
@@ -38,34 +67,23 @@ def main() -> None:
     args.data.parent.mkdir(parents=True, exist_ok=True)
     args.data.unlink(missing_ok=True)
     point_mass.write_point_mass(args.data)
-    rows = []
-    for name in ("ceborl", "rce"):
-        solved = dict.fromkeys(range(EVAL_FREQ, STEPS + 1, EVAL_FREQ), 0)
-        for goal in TASKS:
-            model = ALGOS[name](
-                "MlpPolicy",
-                ENV_ID,
-                str(args.data),
-                examples=point_mass.goal_examples(goal=goal),
-                n_action_samples=4,
-                seed=args.seed,
-                device="cpu",
-                policy_kwargs={"net_arch": [64, 64]},
-            )
-            for step in solved:
-                model.learn(EVAL_FREQ, log_interval=None, reset_num_timesteps=step == EVAL_FREQ)
-                solved[step] += sum(evaluate_success(model, ENV_ID, {"goal": goal}, N_EPISODES).successes)
-            print(name, goal, solved, flush=True)
-        episodes = N_EPISODES * len(TASKS)
-        change = "the defaults"
-        rows += [
-            {"variant": name.upper(), "change": change, "step": step, "successes": n, "episodes": episodes}
-            for step, n in solved.items()
-        ]
-    with args.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    rows: list[dict[str, Any]] = []
+    if args.output.exists():
+        with args.output.open() as file:
+            rows = [row for row in csv.DictReader(file) if row["variant"] in VARIANTS]
+    for variant, (algo, change) in VARIANTS.items():
+        if any(row["variant"] == variant for row in rows):
+            continue
+        by_goal = [successes(algo, change, goal, args.data, args.seed) for goal in TASKS]
+        print(variant, *by_goal, flush=True)
+        said = ", ".join(f"{name}={value}" for name, value in change.items()) or "the defaults"
+        for index, solved in enumerate(zip(*by_goal, strict=True), start=1):
+            counts = {"successes": sum(solved), "episodes": N_EPISODES * len(TASKS)}
+            rows.append({"variant": variant, "change": said, "step": index * EVAL_FREQ, **counts})
+        with args.output.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,8 @@ OFFLINE: dict[str, tuple[type[OfflineAlgorithm], dict[str, Any]]] = {
     "CQL": (CQL, {"cql_alpha": 1.0, "policy_kwargs": NET_ARCH}),
     "IQL": (IQL, {"policy_kwargs": {**NET_ARCH, "critic_layer_norm": True}}),
 }
-DATA_RATIOS = {"half of each batch from the dataset": 0.5, "its own steps alone": 0.0}
+ALONE = "its own steps alone"
+DATA_RATIOS = {"half of each batch from the dataset": 0.5, ALONE: 0.0}
 SCRATCH = "SAC from scratch"
 
 
@@ -120,8 +121,9 @@ def main() -> None:
     if args.output.exists():
         with args.output.open() as file:
             rows = list(csv.DictReader(file))
-    for seed in args.seeds:
-        for method in [*methods(), SCRATCH]:
+    # With its own steps alone last, should it be stopped.
+    for method in sorted([*methods(), SCRATCH], key=lambda name: name.endswith(ALONE)):
+        for seed in args.seeds:
             if any(row["method"] == method and int(row["seed"]) == seed for row in rows):
                 continue
             for index, value in enumerate(run(method, seed, args.data)):
