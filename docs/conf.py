@@ -12,7 +12,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "results/notes.md"]
 html_extra_path = ["pages"]  # made by `sb3-offline inspect --html`
 nitpicky = False  # types of SB3, torch and gymnasium are not looked up: the build needs no network
 
