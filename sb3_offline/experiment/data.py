@@ -15,9 +15,9 @@ def resolve_data(config: dict[str, Any], env_kwargs: dict[str, Any]) -> dict[str
     :param env_kwargs: of the environment
     :return: the config with these texts filled in, and without ``episodes``: its dataset has them alone
     """
-    named: dict[str, Any] = {key: config[key] for key in ("dataset", "examples", "episodes") if key in config}
-    filled: dict[str, Any] = {key: _fill_in(value, key, env_kwargs) for key, value in named.items()}
-    resolved = {**config, **filled}
+    resolved = dict(config)
+    for key in {"dataset", "examples", "episodes"} & config.keys():
+        resolved[key] = _fill_in(config[key], key, env_kwargs)
     episodes = resolved.pop("episodes", None)
     if episodes is not None:
         if resolved.get("dataset") is None:

@@ -27,14 +27,14 @@ class OfflineExperimentManager(ExperimentManager):
     :param args: parsed arguments of the program; its ``env_kwargs`` become the ones that are used, for ``enjoy``
     :param algo: name of the algorithm
     :param rest: see ``rl_zoo3``
-    :param config: YAML file, Python file or package of hyperparameters, or name of a shipped config
     :param kwargs: see ``rl_zoo3``
     """
 
-    def __init__(self, args: argparse.Namespace, algo: str, *rest: Any, config: str | None = None, **kwargs: Any):
-        if algo in sb3_offline.ALGOS and config_path(config or algo).is_file():
-            config = str(config_path(config or algo))
-        super().__init__(args, algo, *rest, config=config, **kwargs)  # type: ignore[misc]
+    def __init__(self, args: argparse.Namespace, algo: str, *rest: Any, **kwargs: Any):
+        super().__init__(args, algo, *rest, **kwargs)
+        config = config_path(kwargs.get("config") or algo)
+        if algo in sb3_offline.ALGOS and config.is_file():
+            self.config = str(config)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         given, self.env_kwargs = self.env_kwargs, {}
