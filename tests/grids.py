@@ -6,6 +6,7 @@ from typing import Any
 import torch as th
 import yaml
 
+from sb3_offline.benchmark.table import table_rows
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data_tools.collect_scripted import collect_scripted
@@ -40,6 +41,11 @@ def collect_data(folder: Path) -> dict[str, str]:
 def write_grid(folder: Path, data: dict[str, str], **changes: Any) -> str:
     (folder / "grid.yml").write_text(yaml.safe_dump({**GRID, **data, **changes}))
     return str(folder / "grid.yml")
+
+
+def rows_of(cells: dict) -> list[dict[str, Any]]:
+    """:return: rows of the table, but not of which commit they are: somebody may commit meanwhile"""
+    return [{name: value for name, value in row.items() if name != "commit"} for row in table_rows(cells)]
 
 
 def assert_same(one: Any, other: Any) -> None:

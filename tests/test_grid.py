@@ -1,6 +1,7 @@
 """A grid of runs: whatever is killed, its table is that of a grid that was not."""
 
 import csv
+import json
 import os
 import signal
 import threading
@@ -9,16 +10,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("metaworld")
 
-from grids import GRID, assert_same, collect_data, write_grid
+from grids import GRID, assert_same, collect_data, rows_of, write_grid
 
 from sb3_offline import cli
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
-from sb3_offline.benchmark.table import table_rows
-from sb3_offline.benchmark.worker import LOCK_FILE, train_run
+from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, current_commit, train_run
 from sb3_offline.experiment.policy_file import load_policy
 from sb3_offline.experiment.training import RESUME_FILE, load_run
 
@@ -61,10 +62,19 @@ def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
         done.set()
         for kill in kills:
             kill.result()
-    assert table_rows(killed) == table_rows(whole) and len(table_rows(whole)) == 4
+    assert rows_of(killed) == rows_of(whole) and len(rows_of(whole)) == 4
     for one, other in zip(killed.values(), whole.values(), strict=True):
         assert_same(*(load_run(run.folder / "model.zip")[0].get_parameters() for run in (one, other)))
         assert [file.name for file in sorted(one.folder.iterdir())] == [file.name for file in sorted(other.folder.iterdir())]
+
+
+def test_a_run_that_goes_on_with_other_code_says_so(tmp_path):
+    provenance = _Provenance(tmp_path / "provenance.json")
+    for step, before, expected in ((5, "a", "a then NOW"), (5, "a then NOW", "a then NOW"), (0, "a", "NOW")):
+        provenance.path.write_text(json.dumps({"commit": before.replace("NOW", current_commit())}))
+        provenance.num_timesteps = step
+        provenance._on_training_start()
+        assert json.loads(provenance.path.read_text())["commit"] == expected.replace("NOW", current_commit())
 
 
 def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
@@ -105,6 +115,20 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path):
     observations = np.random.default_rng(0).normal(size=(5, *model.observation_space.shape)).astype(np.float32)
     assert (policy.predict(observations, deterministic=True)[0] == model.predict(observations, deterministic=True)[0]).all()
     assert config["env"] == GRID["env"] and small.stat().st_size < 1_000_000
+
+
+def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
+    pytest.importorskip("rliable")
+    from sb3_offline.report import aggregates
+
+    monkeypatch.setattr(aggregates, "REPETITIONS", 10)
+    options = ["--methods", "ceborl", "bc", "--tasks", "door-open"]
+    run_benchmark(tmp_path, write_grid(tmp_path, data, n_timesteps=4), *options)
+    cli.main(["report", str(tmp_path / "table.csv"), "-o", str(tmp_path / "report"), "--runs", str(tmp_path / "runs")])
+    text = (tmp_path / "report/report.md").read_text()
+    for name in ("table_door-open.png", "table_values.png"):
+        with Image.open(tmp_path / "report" / name) as picture:
+            assert picture.width > 200 and name in text
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,11 @@ pytest.importorskip("metaworld")
 pytest.importorskip("ray")
 
 import ray
-from grids import assert_same, collect_data, write_grid
+from grids import assert_same, collect_data, rows_of, write_grid
 from ray.cluster_utils import Cluster
 
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.on_ray import train_on_ray
-from sb3_offline.benchmark.table import table_rows
 from sb3_offline.benchmark.worker import train_run
 from sb3_offline.experiment.training import RESUME_FILE, load_run
 
@@ -47,6 +46,6 @@ def test_a_killed_node_loses_nothing(tmp_path):
     assert {run.label for run in over} == {run.label for run in lost.values()}
     for run in whole.values():
         train_run(run)
-    assert table_rows(lost) == table_rows(whole)
+    assert rows_of(lost) == rows_of(whole)
     for one, same in zip(lost.values(), whole.values(), strict=True):
         assert_same(*(load_run(run.folder / "model.zip")[0].get_parameters() for run in (one, same)))
