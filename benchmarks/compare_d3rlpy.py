@@ -3,9 +3,16 @@ CQL, IQL and TD3+BC beside those of d3rlpy: the same data, networks, hyperparame
 
     python benchmarks/compare_d3rlpy.py
 
-collects the dataset (all steps that SB3's SAC takes while it learns Pendulum-v1), trains with both libraries, plays 10
-episodes with each final policy, the same ones for all, and writes results/compare_d3rlpy.csv. Rows that are there are kept, so
-it can be stopped and started again. d3rlpy has to be installed, see CONTRIBUTING.md.
+collects the dataset (all steps that SB3's SAC takes while it learns Pendulum-v1), trains with both libraries, and writes
+results/compare_d3rlpy.csv. Runs that are there are kept, so it can be stopped and started again. d3rlpy has to be installed,
+see CONTRIBUTING.md.
+
+The protocol, fixed before the runs of the file: five seeds, 4000 gradient steps; after each 500 the policy's mode plays 20
+episodes, the same ones for all. A run counts by the mean of its last three checkpoints. Two rows agree if 0 lies in the 95 %
+interval of their difference (Welch's, over the seeds).
+
+CQL stands there twice, since the next action of its target is a sample of the policy here (and in the authors' code), and the
+policy's mode in d3rlpy: once both libraries sample, and once both take the mode.
 """
 
 import argparse
@@ -18,6 +25,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from d3rlpy.logging import NoopAdapterFactory
+from d3rlpy.models.torch import build_squashed_gaussian_distribution
 from d3rlpy.preprocessing import MinMaxActionScaler, StandardObservationScaler
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
@@ -29,30 +37,57 @@ from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
 
 ENV_ID, EPISODE_STEPS = "Pendulum-v1", 200
-FIELDS = ("algorithm", "library", "seed", "gradient_steps", "episodes", "mean_return", "std_return")
+STEPS, EVAL_FREQ, N_EPISODES = 4000, 500, 20
+FIELDS = ("algorithm", "library", "seed", "gradient_steps", "mean_return")
 #: Rewards are divided by this: values of some hundreds take networks long to reach.
 REWARD_DIVISOR = 10.0
 #: Of both libraries. Small and fast: the question is whether they agree, not how far they get.
-BATCH_SIZE, LEARNING_RATE, TAU, GAMMA, N_ACTION_SAMPLES = 128, 1e-3, 0.02, 0.95, 4
+NET_ARCH, BATCH_SIZE, LEARNING_RATE, TAU, GAMMA, N_ACTION_SAMPLES = [64, 64], 128, 1e-3, 0.02, 0.95, 4
 ROOT = Path(__file__).resolve().parent.parent
+SAMPLE, MODE = "CQL, target at a sample", "CQL, target at the mode"
 
+
+class ModeTargetCQL(CQL):
+    """CQL with d3rlpy's target."""
+
+    def _sample_actions(self, policy_features: th.Tensor, next_observations: Any) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        actions, log_densities, _ = super()._sample_actions(policy_features, next_observations)
+        mean, _ = self.actor.gaussian_parameters(self.actor.encode(next_observations))
+        return actions, log_densities, mean.tanh()
+
+
+def sample_targets(impl: Any) -> None:
+    """
+    Give a CQL of d3rlpy our target.
+
+    :param impl: its networks and losses
+    """
+
+    def target(batch: Any) -> th.Tensor:
+        action = build_squashed_gaussian_distribution(impl.policy(batch.next_observations)).sample()
+        return impl._targ_q_func_forwarder.compute_target(batch.next_observations, action, reduction="min")
+
+    impl._compute_deterministic_target = target
+
+
+CQL_SETTINGS = {"cql_alpha": 1.0, "n_action_samples": N_ACTION_SAMPLES}
 OURS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "CQL": (CQL, {"cql_alpha": 1.0, "n_action_samples": N_ACTION_SAMPLES}),
+    SAMPLE: (CQL, CQL_SETTINGS),
+    MODE: (ModeTargetCQL, CQL_SETTINGS),
     "IQL": (IQL, {}),
     "TD3+BC": (TD3BC, {}),
 }
-THEIRS: dict[str, tuple[Any, dict[str, Any]]] = {
+THEIR_CQL_SETTINGS = {
     # No learning rate of alpha: it stays at 1. The factor in front of the penalty is another argument there.
-    "CQL": (
-        d3rlpy.algos.CQLConfig,
-        {
-            "conservative_weight": 1.0,
-            "alpha_learning_rate": 0.0,
-            "temp_learning_rate": LEARNING_RATE,
-            "n_action_samples": N_ACTION_SAMPLES,
-        },
-    ),
-    "IQL": (d3rlpy.algos.IQLConfig, {}),
+    "conservative_weight": 1.0,
+    "alpha_learning_rate": 0.0,
+    "temp_learning_rate": LEARNING_RATE,
+    "n_action_samples": N_ACTION_SAMPLES,
+}
+THEIRS: dict[str, tuple[Any, dict[str, Any]]] = {
+    SAMPLE: (d3rlpy.algos.CQLConfig, THEIR_CQL_SETTINGS),
+    MODE: (d3rlpy.algos.CQLConfig, THEIR_CQL_SETTINGS),
+    "IQL": (d3rlpy.algos.IQLConfig, {"value_encoder_factory": d3rlpy.models.VectorEncoderFactory(NET_ARCH)}),
     "TD3+BC": (d3rlpy.algos.TD3PlusBCConfig, {}),
 }
 
@@ -72,8 +107,14 @@ def collect(path: Path, n_steps: int) -> None:
             writer.add_episode(observations, actions, rewards=buffer.rewards[steps, 0] / REWARD_DIVISOR)
 
 
-def train_ours(name: str, path: Path, n_steps: int, seed: int) -> Any:
-    """:return: the trained model"""
+def mean_return(policy: Any) -> float:
+    """:return: of the policy's mode"""
+    env = make_vec_env(ENV_ID, n_envs=N_EPISODES, seed=EVALUATION_SEED)
+    return float(evaluate_policy(policy, env, N_EPISODES)[0])
+
+
+def train_ours(name: str, path: Path, seed: int) -> list[float]:
+    """:return: returns after each EVAL_FREQ gradient steps"""
     algorithm, settings = OURS[name]
     model = algorithm(
         "MlpPolicy",
@@ -84,9 +125,15 @@ def train_ours(name: str, path: Path, n_steps: int, seed: int) -> Any:
         tau=TAU,
         gamma=GAMMA,
         seed=seed,
+        device="cpu",
+        policy_kwargs={"net_arch": NET_ARCH},
         **settings,
     )
-    return model.learn(n_steps, log_interval=None)
+    returns = []
+    for step in range(0, STEPS, EVAL_FREQ):
+        model.learn(EVAL_FREQ, log_interval=None, reset_num_timesteps=step == 0)
+        returns.append(mean_return(model))
+    return returns
 
 
 class TheirPolicy:
@@ -103,8 +150,8 @@ class TheirPolicy:
         return self.algorithm.predict(observation), None
 
 
-def train_theirs(name: str, path: Path, n_steps: int, seed: int) -> TheirPolicy:
-    """:return: the trained policy"""
+def train_theirs(name: str, path: Path, seed: int) -> list[float]:
+    """:return: returns after each EVAL_FREQ gradient steps"""
     d3rlpy.seed(seed)
     dataset = OfflineDataset(path)
     steps = np.delete(np.arange(dataset.n_steps + dataset.n_episodes), dataset.observation_starts + dataset.lengths)
@@ -119,6 +166,8 @@ def train_theirs(name: str, path: Path, n_steps: int, seed: int) -> TheirPolicy:
     algorithm = config(
         actor_learning_rate=LEARNING_RATE,
         critic_learning_rate=LEARNING_RATE,
+        actor_encoder_factory=d3rlpy.models.VectorEncoderFactory(NET_ARCH),
+        critic_encoder_factory=d3rlpy.models.VectorEncoderFactory(NET_ARCH),
         batch_size=BATCH_SIZE,
         tau=TAU,
         gamma=GAMMA,
@@ -126,42 +175,44 @@ def train_theirs(name: str, path: Path, n_steps: int, seed: int) -> TheirPolicy:
         observation_scaler=StandardObservationScaler(),
         action_scaler=MinMaxActionScaler(minimum=dataset.action_space.low, maximum=dataset.action_space.high),
     ).create()
-    algorithm.fit(data, n_steps, n_steps, logger_adapter=NoopAdapterFactory(), show_progress=False)
-    return TheirPolicy(algorithm)
+    algorithm.build_with_dataset(data)
+    if name == SAMPLE:
+        sample_targets(algorithm.impl)
+    epochs = algorithm.fitter(data, STEPS, EVAL_FREQ, logger_adapter=NoopAdapterFactory(), show_progress=False)
+    return [mean_return(TheirPolicy(algorithm)) for _ in epochs]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/pendulum_replay.h5"), help="collected where it is missing")
     parser.add_argument("--data-steps", type=int, default=10_000)
-    parser.add_argument("--steps", type=int, default=2000, help="gradient steps")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--output", type=Path, default=ROOT / "results" / "compare_d3rlpy.csv")
     args = parser.parse_args()
 
     if not args.data.exists():
         collect(args.data, args.data_steps)
-    rows = []
+    rows: list[dict[str, str]] = []
     if args.output.exists():
         with args.output.open() as file:
             rows = list(csv.DictReader(file))
-    done = {(row["algorithm"], row["library"], int(row["seed"])) for row in rows if int(row["gradient_steps"]) == args.steps}
+    done = {(row["algorithm"], row["library"], int(row["seed"])) for row in rows if int(row["gradient_steps"]) == STEPS}
+    # Runs of another protocol are dropped.
+    rows = [row for row in rows if (row["algorithm"], row["library"], int(row["seed"])) in done]
     for seed in args.seeds:
         for name in OURS:
             for library, train in (("sb3-offline", train_ours), ("d3rlpy", train_theirs)):
                 if (name, library, seed) in done:
                     continue
-                policy = train(name, args.data, args.steps, seed)
-                env = make_vec_env(ENV_ID, seed=EVALUATION_SEED)
-                returns, _ = evaluate_policy(policy, env, args.episodes, return_episode_rewards=True)
-                values = (name, library, seed, args.steps, args.episodes, f"{np.mean(returns):.1f}", f"{np.std(returns):.1f}")
-                rows.append(dict(zip(FIELDS, map(str, values), strict=True)))
+                returns = train(name, args.data, seed)
+                for index, value in enumerate(returns, start=1):
+                    values = (name, library, str(seed), str(index * EVAL_FREQ), f"{value:.1f}")
+                    rows.append(dict(zip(FIELDS, values, strict=True)))
                 with args.output.open("w", newline="") as file:
                     writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
                     writer.writeheader()
                     writer.writerows(rows)
-                print(*values, flush=True)
+                print(name, library, seed, *(f"{value:.1f}" for value in returns), flush=True)
 
 
 if __name__ == "__main__":

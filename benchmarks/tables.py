@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import ttest_ind
+
 from sb3_offline.demo.pipeline import result_table
 from sb3_offline.report.results import comparison_table, read_results
 
@@ -123,17 +125,30 @@ def rate_table(rows: list[dict[str, str]]) -> str:
 
 
 def library_table(rows: list[dict[str, str]]) -> str:
-    """A row an algorithm, a column a library: mean return and standard deviation over the seeds."""
-    libraries = list(dict.fromkeys(row["library"] for row in rows))
-    lines = ["| algorithm | gradient steps | seeds | " + " | ".join(libraries) + " |", "|---" * (3 + len(libraries)) + "|"]
+    """
+    Two rows an algorithm: mean return at each checkpoint, that of the last three with the standard deviation between seeds,
+    and the 95 % interval of the difference between the libraries.
+    """
+    steps = sorted({int(row["gradient_steps"]) for row in rows})
+    header = ["algorithm", "library", "seeds", *(f"step {step}" for step in steps), "last three", "difference"]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for algorithm in dict.fromkeys(row["algorithm"] for row in rows):
-        own = [row for row in rows if row["algorithm"] == algorithm]
-        seeds = dict.fromkeys(row["seed"] for row in own)
-        cells = []
-        for library in libraries:
-            returns = [float(row["mean_return"]) for row in own if row["library"] == library]
-            cells.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
-        lines.append(f"| {algorithm} | {own[0]['gradient_steps']} | {', '.join(seeds)} | " + " | ".join(cells) + " |")
+        cells, counted = [], []
+        for library in dict.fromkeys(row["library"] for row in rows):
+            own = {
+                (row["seed"], int(row["gradient_steps"])): float(row["mean_return"])
+                for row in rows
+                if (row["algorithm"], row["library"]) == (algorithm, library)
+            }
+            seeds = list(dict.fromkeys(seed for seed, _ in own))
+            curve = [f"{statistics.mean(own[seed, step] for seed in seeds):.0f}" for step in steps]
+            counted.append([statistics.mean(own[seed, step] for step in steps[-3:]) for seed in seeds])
+            last = f"{statistics.mean(counted[-1]):.0f} ± {statistics.stdev(counted[-1]):.0f}"
+            cells.append([algorithm, library, str(len(seeds)), *curve, last])
+        ours, theirs = counted
+        interval = ttest_ind(ours, theirs, equal_var=False).confidence_interval()
+        difference = f"{statistics.mean(ours) - statistics.mean(theirs):+.0f} ({interval.low:+.0f} to {interval.high:+.0f})"
+        lines += [f"| {' | '.join([*cells[0], difference])} |", f"| {' | '.join([*cells[1], ''])} |"]
     return "\n".join(lines)
 
 
