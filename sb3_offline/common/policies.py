@@ -202,8 +202,8 @@ class OfflineCritic(ContinuousCritic):
             assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
             state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
             of_state = linear(features, state_weight, q_net[0].bias)
-            layers = [(action_weight, of_state), *list(q_net)[1:]]
-            outputs.append(run_layers(layers, samples.flatten(0, 1)).view(samples.shape[:2]))
+            values = run_layers([(action_weight, of_state), *list(q_net)[1:]], samples.flatten(0, 1))
+            outputs.append(values.view(samples.shape[:2]))
         return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
@@ -225,7 +225,8 @@ class OfflineCritic(ContinuousCritic):
 
 def _encode(module: OfflineActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
     """Features of observations; all that is computed from them keeps their dtype, so it is chosen here."""
-    encoder, device = module.features_extractor, module.device
+    encoder = module.features_extractor
+    device = (next(iter(obs.values())) if isinstance(obs, dict) else obs).device  # SB3's `module.device` walks through modules
     bfloat16 = has_fast_bfloat16(device) if module.mixed_precision is None else module.mixed_precision
     with th.autocast(device.type, th.bfloat16, enabled=bfloat16):
         if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
