@@ -22,7 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from throughput import ACTIONS, BATCH_SIZE, OBSERVATIONS, RESULTS, interleave, merge, ours, write_transitions
+from throughput import ACTIONS, BATCH_SIZE, OBSERVATIONS, RESULTS, interleave, merge, one_step, ours, write_transitions
 
 import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.common.augmentation import random_shift
@@ -167,19 +167,19 @@ def growth_entries(folder: Path, sizes: tuple[int, ...], seconds: float) -> list
     for size in sizes:
         path = folder / "growing.h5"
         write_frames(path, size)
-        step = ours("ceborl", "pixels", path, True, dataset_storage="mmap")
+        step = one_step(ours("ceborl", "pixels", path, True, dataset_storage="mmap"))
         times = interleave({"step": step}, 2, seconds)["step"]
         entries.append({"name": "growth_frames", "frames": size, "ours_ms": round(float(np.median(np.concatenate(times))), 1)})
         path.unlink()
     path = folder / "states.h5"
     write_transitions(path, OBSERVATIONS["states"])
     for k in (1, 4, 8, 16, 32, 64):
-        times = interleave({"step": ours("ceborl", "states", path, False, n_action_samples=k)}, 2, seconds)["step"]
+        step = one_step(ours("ceborl", "states", path, False, n_action_samples=k))
+        times = interleave({"step": step}, 2, seconds)["step"]
         entries.append({"name": "growth_action_samples", "k": k, "ours_ms": round(float(np.median(np.concatenate(times))), 2)})
     for batch_size in (64, 128, 256, 512, 1024):
-        step = ours("ceborl", "states", path, False)
-        model = step.__closure__[0].cell_contents  # type: ignore[index]
-        times = interleave({"step": lambda model=model, n=batch_size: model.train(1, n)}, 2, seconds)["step"]  # type: ignore
+        step = one_step(ours("ceborl", "states", path, False), batch_size)
+        times = interleave({"step": step}, 2, seconds)["step"]
         entries.append(
             {"name": "growth_batch", "batch": batch_size, "ours_ms": round(float(np.median(np.concatenate(times))), 2)}
         )
@@ -248,8 +248,6 @@ def main() -> None:
             + data_entries(Path(name), step_ms)
             + growth_entries(Path(name), tuple(args.sizes), args.seconds)
         )
-    old = [entry for entry in json.loads(args.output.read_text())] if args.output.exists() else []
-    args.output.write_text(json.dumps([entry for entry in old if not entry["name"].startswith("growth_")], indent=1))
     merged = merge(args.output, entries)
     if args.output == RESULTS:
         draw(merged, FIGURE)

@@ -24,7 +24,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from torch.utils.flop_counter import FlopCounterMode, register_flop_formula
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_offline import ALGOS
 from sb3_offline.common.process import prepare_process
@@ -72,7 +73,7 @@ def write_transitions(path: Path, space: spaces.Box) -> tuple[np.ndarray, np.nda
     return np.concatenate([episode[:-1] for episode in observations]), np.concatenate(actions)
 
 
-def ours(algo: str, kind: str, data: Path, mixed_precision: bool, **kwargs: Any) -> Step:
+def ours(algo: str, kind: str, data: Path, mixed_precision: bool, **kwargs: Any) -> BaseAlgorithm:
     policy = "CnnPolicy" if kind == "pixels" else "MlpPolicy"
     policy_kwargs = {"net_arch": LAYERS, "mixed_precision": mixed_precision}
     if algo in ("ceborl", "rce"):
@@ -85,15 +86,18 @@ def ours(algo: str, kind: str, data: Path, mixed_precision: bool, **kwargs: Any)
         kwargs["example_batch_size"] = N_EXAMPLES
     model = ALGOS[algo](policy, None, dataset=str(data), batch_size=BATCH_SIZE, policy_kwargs=policy_kwargs, seed=0, **kwargs)
     model._setup_learn(1)
-    return lambda: model.train(1, BATCH_SIZE)
+    return model
 
 
-def sb3_sac(kind: str) -> Step:
+def sb3_sac(kind: str) -> BaseAlgorithm:
     policy = "CnnPolicy" if kind == "pixels" else "MlpPolicy"
     kwargs = {"net_arch": LAYERS}  # SB3's CnnPolicy has no hidden layers in its heads otherwise
     model = SAC(policy, RandomEnv(OBSERVATIONS[kind]), buffer_size=2000, policy_kwargs=kwargs, seed=0)
-    model.learn(101)
-    return lambda: model.train(gradient_steps=1, batch_size=BATCH_SIZE)
+    return model.learn(101)
+
+
+def one_step(model: Any, batch_size: int = BATCH_SIZE) -> Step:
+    return lambda: model.train(1, batch_size)
 
 
 def d3rlpy_cql(kind: str, observations: np.ndarray, actions: np.ndarray, n_action_samples: int) -> Step:
@@ -145,14 +149,13 @@ def comparison(name: str, times: dict[str, list[list[float]]], our: str, peer: s
     }
 
 
-@register_flop_formula(th.ops.mkldnn._linear_pointwise)
 def _linear_flop(x_shape: Any, weight_shape: Any, *args: Any, out_shape: Any = None, **kwargs: Any) -> int:
     return 2 * int(np.prod(x_shape)) * weight_shape[0]
 
 
 def floor_entry(name: str, step: Step, median_ms: float, mixed_precision: bool, n_bytes: int) -> dict[str, Any]:
     """Operations of a step over the rate of a large product, and the batch's bytes over the rate of a copy."""
-    with FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
         step()
     dtype = th.bfloat16 if mixed_precision else th.float32
     left, right = th.randn(4096, 256).to(dtype), th.randn(256, 256).to(dtype)
@@ -192,10 +195,13 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     if kind == "states":
         others = ("rce", "bc", "iql", "td3_bc")
         learners.update({"in_sample": ("ceborl", {"beta": 0.0}), **{algo: (algo, {}) for algo in others}})
-    steps: dict[str, Step] = {"SB3 SAC": sb3_sac(kind), "d3rlpy CQL": d3rlpy_cql(kind, observations, actions, k_of_cql)}
+    steps: dict[str, Step] = {
+        "SB3 SAC": one_step(sb3_sac(kind)),
+        "d3rlpy CQL": d3rlpy_cql(kind, observations, actions, k_of_cql),
+    }
     for name, (algo, kwargs) in learners.items():
-        steps[name] = ours(algo, kind, data, False, **kwargs)
-        steps[f"{name}_bf16"] = ours(algo, kind, data, True, **kwargs)
+        steps[name] = one_step(ours(algo, kind, data, False, **kwargs))
+        steps[f"{name}_bf16"] = one_step(ours(algo, kind, data, True, **kwargs))
     times = interleave(steps, rounds, seconds)
 
     entries = []

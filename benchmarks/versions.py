@@ -1,0 +1,78 @@
+"""
+Whether a change made steps faster: another checkout of this library and this one, in turn in one process, with one thread.
+
+    git worktree add /tmp/before HEAD~5
+    python benchmarks/versions.py /tmp/before ceborl ceborl_bf16 cql_bf16 in_sample_bf16
+
+Takes the processor time of the thread, which other processes on the machine disturb less than the time on the clock, and
+prints the median of before / after over pairs of a few steps each, with its quartiles. `in_sample` is CEBORL with beta = 0.
+"""
+
+import argparse
+import importlib
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch as th
+
+STEPS = {"states": 4, "pixels": 1}
+
+
+def load(checkout: Path) -> ModuleType:
+    """:return: ``throughput.py`` beside this file, on the library in that checkout"""
+    for name in [name for name in sys.modules if name.split(".")[0] in ("sb3_offline", "throughput")]:
+        del sys.modules[name]
+    sys.path.insert(0, str(checkout.resolve()))
+    try:
+        return importlib.import_module("throughput")
+    finally:
+        del sys.path[0]
+
+
+def milliseconds(model: object, steps: int) -> float:
+    model.train(1, 256)  # type: ignore[attr-defined]  (what the model before left in the caches is not counted)
+    began = time.thread_time()
+    for _ in range(steps):
+        model.train(1, 256)  # type: ignore[attr-defined]
+    return 1e3 * (time.thread_time() - began) / steps
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path, help="the other checkout")
+    parser.add_argument("learners", nargs="+", help="names of algorithms, with _bf16 at the end for bfloat16")
+    parser.add_argument("--kind", choices=STEPS, default="states")
+    parser.add_argument("--pairs", type=int, default=20)
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / "data.h5"
+        models: dict[str, list[object]] = {name: [] for name in args.learners}
+        for checkout in (args.before, Path(__file__).parents[1]):
+            throughput = load(checkout)
+            throughput.prepare_process()
+            if not data.exists():
+                throughput.write_transitions(data, throughput.OBSERVATIONS[args.kind])
+            for name, both in models.items():
+                algo, kwargs = name.removesuffix("_bf16"), {}
+                if algo == "in_sample":
+                    algo, kwargs = "ceborl", {"beta": 0.0}
+                both.append(throughput.ours(algo, args.kind, data, name.endswith("_bf16"), **kwargs))
+        steps = STEPS[args.kind]
+        times = {name: np.empty((args.pairs, 2)) for name in models}
+        for pair in range(args.pairs):
+            for name, both in models.items():
+                times[name][pair] = [milliseconds(model, steps) for model in both]
+    for name, pairs in times.items():
+        (before, after), (low, ratio, high) = pairs.min(axis=0), np.quantile(pairs[:, 0] / pairs[:, 1], (0.25, 0.5, 0.75))
+        print(
+            f"{name}: {ratio:.2f} times as fast ({low:.2f} to {high:.2f}); at best {before:.2f} before, {after:.2f} ms after"
+        )
+
+
+if __name__ == "__main__":
+    main()
