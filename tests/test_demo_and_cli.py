@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sb3_offline import cli
+from sb3_offline import ALGOS, cli
+from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.demo.pipeline import METHODS, DemoSettings, run_demo
 from sb3_offline.experiment.config import load_config, parse_overrides
@@ -70,6 +71,19 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     capsys.readouterr()
     cli.main(["evaluate", f"{run}/model.zip", "--episodes", "1"])
     assert "of 1 episodes solved" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):
+    dataset, examples = (str(next((demo[0] / "data").glob(f"{name}-*.h5"))) for name in ("dataset", "examples"))
+    train = ["train", "--algo", algo, "--task", "drawer-open", "--dataset", dataset, "-n", "2", "-o", str(tmp_path)]
+    if issubclass(ALGOS[algo], ExampleBasedAlgorithm):
+        train += ["--examples", examples]
+    if algo == "oril":
+        train += ["--hyperparams", "reward_steps:2"]
+    cli.main(train)
+    model = ALGOS[algo].load(tmp_path / "model.zip")
+    assert model.num_timesteps == 2 and model._n_updates == 2
 
 
 @pytest.mark.parametrize(
