@@ -264,9 +264,11 @@ class NormalizedFeatures(BaseFeaturesExtractor):
         return self.norm(observations)
 
 
+BATCH_NORM = {**SMALL, "features_extractor_class": NormalizedFeatures}
+
+
 def test_running_statistics_reach_the_target(dataset):
-    kwargs = {**SMALL, "features_extractor_class": NormalizedFeatures}
-    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, policy_kwargs=kwargs).learn(3)
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, policy_kwargs=BATCH_NORM).learn(3)
     online, target = model.critic.features_extractor.norm, model.critic_target.features_extractor.norm
     assert th.equal(online.running_mean, target.running_mean) and online.running_mean.abs().min() > 0
 
@@ -281,9 +283,8 @@ def test_images_given_to_an_mlp_are_only_scaled(dataset):
 def test_every_batch_of_images_is_shifted(dataset, monkeypatch):
     examples = make_observations(IMAGES, 4, np.random.default_rng(0))
     kwargs = {**SMALL, "features_extractor_kwargs": {"features_dim": 16}}
-    model = CEBORL(
-        "CnnPolicy", None, dataset / "images.h5", examples, batch_size=8, example_batch_size=4, policy_kwargs=kwargs
-    )
+    sizes_of_batches = {"batch_size": 8, "example_batch_size": 4}
+    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, policy_kwargs=kwargs, **sizes_of_batches)
     sizes, augment = [], model.augment
     monkeypatch.setattr(model, "augment", lambda batch: sizes.append(len(batch)) or augment(batch))
     model.learn(1)
@@ -301,3 +302,11 @@ def test_random_shift_repeats_edges(max_shift):
     for rows in (slice(0, GROUP_SIZE), slice(GROUP_SIZE, None)):
         down, right = rng.integers(-max_shift, max_shift + 1, size=2) + max_shift if max_shift else (0, 0)
         np.testing.assert_array_equal(shifted[rows], padded[rows, :, down : down + 9, right : right + 11])
+
+
+def test_a_frozen_encoder_stays_frozen(dataset):
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, batch_size=8, policy_kwargs=BATCH_NORM, **PAPER_FORM)
+    model.critic.features_extractor.requires_grad_(False)
+    model.learn(2)
+    assert not any(parameter.requires_grad for parameter in model.critic.features_extractor.parameters())
+    assert all(parameter.requires_grad for net in model.critic.q_networks for parameter in net.parameters())
