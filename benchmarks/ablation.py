@@ -1,10 +1,11 @@
 """
 One change at a time from CEBORL's defaults, on state observations: what each part of the working form is worth.
 
-    python benchmarks/ablation.py --data data/scripted1500.h5 --examples-dir data/examples --tasks door-open plate-slide
+    sb3-offline collect-sac data/sac_states.h5 --examples data/sac_states_examples
+    python benchmarks/ablation.py
 
-collects data and examples where they are missing, trains every variant (finished ones are kept, so it can be stopped and
-started again) and writes results/ablation.csv, one row a checkpoint, and docs/images/ablation.png. The protocol stands in
+trains every variant for 2000 gradient steps (finished ones are kept, so it can be stopped and started again) and writes
+results/ablation.csv, one row a checkpoint, and docs/images/ablation.png. The protocol stands in
 sb3_offline/benchmark/grid.py. Nothing is chosen by its score.
 """
 
@@ -14,14 +15,13 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from scripted_data import TASKS, add_arguments, prepare_data
-
 from sb3_offline.benchmark.grid import Grid, Method
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import run_grid
 from sb3_offline.benchmark.table import write_table
 from sb3_offline.ceborl import PAPER_FORM
 from sb3_offline.data_tools.rollout import ENV_ID
+from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.experiment.evaluation import success_interval
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,8 +79,10 @@ FIELDS = ("group", "variant", "task", "seed", "step", "episodes", "successes", "
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser)
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["door-open", "plate-slide"])
+    parser.add_argument("--data", default="data/sac_states.h5")
+    parser.add_argument("--examples", default="data/sac_states_examples/{task}.h5")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["dial-turn", "door-open"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
     parser.add_argument("--runs", type=Path, default=Path("runs/ablation"))
@@ -89,15 +91,14 @@ def main() -> None:
     parser.add_argument("--no-training", action="store_true", help="write the table of the runs that are finished")
     args = parser.parse_args()
 
-    prepare_data(args)
     grid = Grid(
         env=ENV_ID,
         methods={name: Method("ceborl", "ceborl", VARIANTS[name]) for name in args.variants},
         tasks=args.tasks,
         seeds=args.seeds,
-        n_timesteps=3000,
-        dataset=str(args.data),
-        examples=str(args.examples_dir / "state-{task}.h5"),
+        n_timesteps=2000,
+        dataset=args.data,
+        examples=args.examples,
     )
     train = None if args.no_training else functools.partial(train_locally, n_workers=args.workers)
     for line in run_grid(grid, args.runs, args.output, train, write_variants):

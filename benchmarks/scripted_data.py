@@ -17,20 +17,8 @@ from sb3_offline.data_tools.extract_examples import extract_examples
 N_EXAMPLES, HELD_OUT_SEED, HELD_OUT_EPISODES = 200, 1000, 120
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """:param parser: gets the options of :func:`prepare_data`"""
-    parser.add_argument("--data", type=Path, default=Path("data/scripted1500.h5"))
-    parser.add_argument("--episodes-per-task", type=int, default=1500)
-    parser.add_argument("--examples-dir", type=Path, default=Path("data/examples"))
-    parser.add_argument("--workers", type=int, default=2)
-
-
 def prepare_data(args: argparse.Namespace) -> None:
-    """
-    Collect what is missing.
-
-    :param args: what :func:`add_arguments` asks for
-    """
+    """Collect what is missing."""
     held_out = args.examples_dir / "held_out.h5"
     files = {task: args.examples_dir / f"state-{task}.h5" for task in TASKS}
     missing = {task: file for task, file in files.items() if not file.exists()}
@@ -47,5 +35,8 @@ def prepare_data(args: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser)
+    parser.add_argument("--data", type=Path, default=Path("data/scripted1500.h5"))
+    parser.add_argument("--episodes-per-task", type=int, default=1500)
+    parser.add_argument("--examples-dir", type=Path, default=Path("data/examples"))
+    parser.add_argument("--workers", type=int, default=2)
     prepare_data(parser.parse_args())
