@@ -111,8 +111,7 @@ def episode_writer(
 ) -> DatasetWriter:
     """
     A step's `success` is that of the attempted task, which is the episode's `source`; the file holds no `rewards`, since those
-    of five tasks would be mixed in it. Extras: those of `TaskEpisode`; `state` among
-    them, so that files of frames hold it too.
+    of five tasks would be mixed in it. Extras: those of `TaskEpisode`; with `state` among them, files of frames hold it too.
 
     :param path: of the file
     :param obs_type: "state" or "pixels"

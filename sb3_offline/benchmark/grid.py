@@ -5,10 +5,8 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
-from sb3_offline.experiment.config import config_path, load_config
+from sb3_offline.experiment.config import load_config, read_yaml
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
 from sb3_offline.experiment.training import EvaluationTable, find_algorithm, is_finished, run_record
 
@@ -152,14 +150,7 @@ def load_grid(name: str) -> Grid:
     :param name: a YAML file, or a shipped grid's name (``"table1_states"``)
     :return: what it holds
     """
-    path = config_path(name if Path(name).suffix else f"grids/{name}")
-    if not path.is_file():
-        shipped = sorted(file.stem for file in config_path("grids/any").parent.glob("*.yml"))
-        raise RuntimeError(f"{path}: there is no such grid; give a path, or one of {', '.join(shipped)}")
-    try:
-        content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+    path, content = read_yaml(name, "grid", "grids/")
     content = _checked(content, Grid, f"{path}")
     for key, kind in (("methods", Mapping), ("env_kwargs", Mapping), ("tasks", list), ("seeds", list)):
         if key in content and not (isinstance(content[key], kind) and (content[key] or key == "env_kwargs")):
@@ -214,7 +205,7 @@ def _run(grid: Grid, name: str, seed: int, tasks: tuple[str, ...], runs: Path) -
     method, of_task = grid.methods[name], len(tasks) == 1 and _depends_on_task(grid, grid.methods[name])
     if _takes_examples(method) and grid.examples is None:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
-    config = merged(load_config(method.config, grid.env), method.changes)
+    config = _config(grid, method)
     config["env_kwargs"] = {**config.get("env_kwargs", {}), **grid.env_kwargs}
     arguments = {
         "algo": method.algo,
@@ -229,13 +220,17 @@ def _run(grid: Grid, name: str, seed: int, tasks: tuple[str, ...], runs: Path) -
     return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tasks, arguments, grid)
 
 
+def _config(grid: Grid, method: Method) -> dict[str, Any]:
+    return merged(load_config(method.config, grid.env), method.changes)
+
+
 def _takes_examples(method: Method) -> bool:
     return issubclass(find_algorithm(method.algo), ExampleBasedAlgorithm)
 
 
 def _depends_on_task(grid: Grid, method: Method) -> bool:
     """:return: whether a policy learns from anything that is another one for another task: examples, files, or episodes"""
-    config = merged(load_config(method.config, grid.env), method.changes)
+    config = _config(grid, method)
     texts = [grid.dataset, config.get("episodes"), grid.examples if _takes_examples(method) else None]
     return any("{task}" in str(text) for text in texts)
 

@@ -20,20 +20,30 @@ def config_path(name: str) -> Path:
     return Path(str(resources.files("sb3_offline.zoo_configs") / f"{name}.yml"))
 
 
+def read_yaml(name: str, kind: str, folder: str = "") -> tuple[Path, Any]:
+    """
+    :param name: a YAML file, or the name of a shipped one
+    :param kind: what it is called where it is missing
+    :param folder: of the shipped ones, inside ``zoo_configs``, with a slash at its end
+    :return: the file, and what it holds
+    """
+    path = config_path(name if Path(name).suffix else folder + name)
+    if not path.is_file():
+        shipped = sorted(file.stem for file in config_path(f"{folder}any").parent.glob("*.yml"))
+        raise RuntimeError(f"{path}: there is no such {kind}; give a path, or one of {', '.join(shipped)}")
+    try:
+        return path, yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+
+
 def load_config(name: str, env_id: str) -> dict[str, Any]:
     """
     :param name: see :func:`config_path`
     :param env_id: section to read; ``default`` where the file has no such section
     :return: constructor arguments of the algorithm, and ``policy``, ``n_timesteps``, ``env_kwargs``
     """
-    path = config_path(name)
-    if not path.is_file():
-        shipped = sorted(file.stem for file in config_path("ceborl").parent.glob("*.yml"))
-        raise RuntimeError(f"{path}: there is no such config file; give a path, or one of {', '.join(shipped)}")
-    try:
-        sections = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+    path, sections = read_yaml(name, "config file")
     if not isinstance(sections, dict):
         raise RuntimeError(f"{path}: has no sections; write `{env_id}:` and hyperparameters below it, indented")
     section = sections.get(env_id, sections.get("default"))

@@ -39,31 +39,29 @@ def _run(label: str, arguments: dict[str, Any], reports: Any) -> None:
     train(**arguments, progress_bar=False, callbacks=[_ReportProgress(reports, label)])
 
 
-def train_in_parallel(
-    runs: Mapping[str, dict[str, Any]], n_workers: int, keep_going: bool = False
-) -> dict[str, BaseException]:
+def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> None:
     """
+    Where a run fails, the others are stopped and its error is raised.
+
     :param runs: label to the arguments of :func:`~sb3_offline.experiment.training.train`; they are started in this order
     :param n_workers: processes
-    :param keep_going: let the other runs finish where one fails; else its error is raised at once
-    :return: what went wrong, by label
     """
     if not runs:
-        return {}
+        return
     context = multiprocessing.get_context("spawn")
     reports = context.Manager().Queue()
     bars: dict[str, tqdm] = {}
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
-        futures: list[Future] = [
+        futures: set[Future] = {
             pool.submit(functools.partial(_run, label, arguments, reports)) for label, arguments in runs.items()
-        ]
+        }
         try:
-            while not all(future.done() for future in futures):
-                wait(futures, timeout=POLL_SECONDS)
+            running = futures
+            while running:
+                done, running = wait(running, timeout=POLL_SECONDS)
                 _show(reports, bars, runs)
-                for future in futures:
-                    if future.done() and not keep_going:
-                        future.result()  # raises what went wrong in there, without waiting for the others
+                for future in done:
+                    future.result()  # raises what went wrong in there, without waiting for the others
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -71,8 +69,6 @@ def train_in_parallel(
             raise
     for bar in bars.values():
         bar.close()
-    errors = {label: future.exception() for label, future in zip(runs, futures, strict=True)}
-    return {label: error for label, error in errors.items() if error is not None}
 
 
 def _show(reports: Any, bars: dict[str, tqdm], runs: Mapping[str, dict[str, Any]]) -> None:
