@@ -52,7 +52,7 @@ class Reading:
         self.losses = []
         monkeypatch.setattr(model.replay_buffer, "sample", lambda *_, **__: self.batch)
         monkeypatch.setattr(model, "sample_examples", lambda: (examples, rows))
-        monkeypatch.setattr(model, "_sample_penalized_actions", lambda _: self.penalized)
+        monkeypatch.setattr(model, "_sample_penalized_actions", lambda *_: self.penalized)
         monkeypatch.setattr(actor, "sample", lambda z: (th.tanh(actor.gaussian_parameters(z)[0]), th.full((len(z),), -3.0)))
         monkeypatch.setattr(model, "_optimize", lambda optimizer, loss: self.losses.append((optimizer, loss)))
 

@@ -215,7 +215,6 @@ class CEBORL(ExampleBasedAlgorithm):
             examples, example_rows = self.sample_examples()
             examples = self.augment(examples)
             example_features = self.critic.encode(examples)[example_rows]
-            policy_features = self._policy_features(observations, features)
             with th.no_grad():
                 example_policy_features = self._policy_features(examples, example_features, example_rows)
                 example_actions, _ = self.actor.sample(example_policy_features)
@@ -234,7 +233,7 @@ class CEBORL(ExampleBasedAlgorithm):
             term_b = self._example_term(logits[:, len(features) :], example_omega)
             critic_loss = term_c + term_b
             if self.beta > 0:
-                sampled_logits = self.critic.values(features, self._sample_penalized_actions(policy_features))
+                sampled_logits = self.critic.values(features, self._sample_penalized_actions(observations, features))
                 term_a = conservative_penalty(data_logits, sampled_logits, self.penalty_space)
                 critic_loss = critic_loss + self.beta * term_a
                 self._record(penalty=term_a, classifier_penalized=sampled_logits.sigmoid().mean())
@@ -261,7 +260,7 @@ class CEBORL(ExampleBasedAlgorithm):
                 actor_loss = self.actor.regression_loss(*self._draw_imitated(batch_size)).mean()
                 self._record(effective_weights=self._weighted_transitions.effective_share())
             else:  # Eq. 11
-                actions, log_prob = self.actor.sample(policy_features)
+                actions, log_prob = self.actor.sample(self._policy_features(observations, features))
                 classifier = self._values_of_policy(features, actions).amin(dim=0).sigmoid()
                 actor_loss = (self.ent_coef * log_prob - classifier).mean()
             self._optimize(self.actor.optimizer, actor_loss)
@@ -275,7 +274,7 @@ class CEBORL(ExampleBasedAlgorithm):
                 classifier_examples=example_logits.sigmoid().mean(),
             )
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
-                self._record_diagnostics(features, policy_features, discounted_omega / self.gamma)
+                self._record_diagnostics(observations, features, discounted_omega / self.gamma)
 
     def _draw_imitated(self, batch_size: int) -> tuple[th.Tensor, th.Tensor]:
         """:return: features and actions of the last batches' transitions, drawn by their weights"""
@@ -332,9 +331,10 @@ class CEBORL(ExampleBasedAlgorithm):
         self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
         return logits.chunk(len(successors), dim=1)
 
-    def _sample_penalized_actions(self, features: th.Tensor) -> th.Tensor:
+    def _sample_penalized_actions(self, observations: PyTorchObs, features: th.Tensor) -> th.Tensor:
         """
-        :param features: ``(batch, features_dim)``
+        :param observations: a batch
+        :param features: of the critic's encoder, ``(batch, features_dim)``
         :return: K actions from mu for each state, ``(batch, K, action_dim)``, no gradient
         """
         n_policy = {"uniform": 0, "mixture": self.n_action_samples // 2, "policy": self.n_action_samples}[self.mu]
@@ -343,11 +343,12 @@ class CEBORL(ExampleBasedAlgorithm):
         if n_policy == 0:
             return uniform
         with th.no_grad():
-            return th.cat([uniform, self.actor.sample(features, n_policy)[0]], dim=1)
+            policy_features = self._policy_features(observations, features)
+            return th.cat([uniform, self.actor.sample(policy_features, n_policy)[0]], dim=1)
 
     @th.no_grad()
-    def _record_diagnostics(self, features: th.Tensor, policy_features: th.Tensor, omega: th.Tensor) -> None:
-        actions, log_prob = self.actor.sample(policy_features)
+    def _record_diagnostics(self, observations: PyTorchObs, features: th.Tensor, omega: th.Tensor) -> None:
+        actions, log_prob = self.actor.sample(self._policy_features(observations, features))
         p50, p99 = th.quantile(omega, th.tensor([0.5, 0.99], device=omega.device))
         self._record(
             log_prob=log_prob.mean(),
