@@ -72,7 +72,9 @@ def card_table(card: dict[str, Any]) -> str:
 def throughput_table(entries: list[dict[str, Any]]) -> str:
     """Three tables: beside peers, against the floor, and all other costs."""
     lines = ["| | ours, ms | peer | peer, ms | times as fast |", "|---" * 5 + "|"]
-    floors = ["| | ms | floor, ms | GFLOP a step | GFLOP/s of a product | over the floor |", "|---" * 6 + "|"]
+    columns = "| | ms | floor, ms | GFLOP a step | GFLOP/s of a product | over the floor | SB3's SAC over the floor |"
+    floors = [columns, "|---" * 7 + "|"]
+    sac_ms = {entry["name"].partition("_vs_sb3_sac")[0]: entry["peer_ms"] for entry in entries if "peer_ms" in entry}
     others = ["| | ms | |", "|---" * 3 + "|"]
     for entry in entries:
         name, notes = f"`{entry['name']}`", []
@@ -81,7 +83,9 @@ def throughput_table(entries: list[dict[str, Any]]) -> str:
             ratio = f"{entry['ratio']:g}" + (f" ({low:g} to {high:g})" if low < high else "")
             lines.append(f"| {name} | {entry['ours_ms']:g} | {entry['peer']} | {entry['peer_ms']:g} | {ratio} |")
         elif "floor_ms" in entry:
-            cells = (entry[key] for key in ("ours_ms", "floor_ms", "gflop", "gflop_per_second", "over_floor"))
+            cells = [entry[key] for key in ("ours_ms", "floor_ms", "gflop", "gflop_per_second", "over_floor")]
+            learner = entry["name"].removeprefix("floor_").removesuffix("_bf16")
+            cells.append(round(sac_ms[learner] / entry["floor_ms"], 2))
             floors.append(f"| {name} | " + " | ".join(f"{cell:g}" for cell in cells) + " |")
         elif entry["name"] == "machine":
             others.append(f"| machine | | {entry['cpu']}, {entry['threads']} threads, torch {entry['torch']} |")
