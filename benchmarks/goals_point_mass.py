@@ -5,11 +5,12 @@ Learners from examples on a point mass in the plane; each task is told by 50 exa
 
 The data are of two kinds: attempts that head for the five goals alike, and play, pushes in any direction that are held for
 five steps, so that the data hold every action. Writes results/point_mass.csv: of the first three goals together, episodes
-solved by the policy's mode after each 500 gradient steps. Variants that are in the file are not run again.
+solved by the policy's mode after each 500 gradient steps. Runs that are in the file are not repeated.
 """
 
 import argparse
 import csv
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,8 @@ def successes(algo: str, change: dict[str, Any], goal: int, data: Path, seed: in
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
     parser.add_argument("--data", type=Path, default=Path("runs/point_mass"), help="folder, written anew")
     parser.add_argument("--output", type=Path, default=ROOT / "results" / "point_mass.csv")
     args = parser.parse_args()
@@ -89,15 +91,18 @@ def main() -> None:
     if args.output.exists():
         with args.output.open() as file:
             rows = [row for row in csv.DictReader(file) if row["variant"] in VARIANTS]
-    for variant, (data, algo, change) in VARIANTS.items():
-        if any(row["variant"] == variant for row in rows):
+    done = {(row["variant"], int(row["seed"])) for row in rows}
+    for seed, variant in itertools.product(args.seeds, args.variants):
+        if (variant, seed) in done:
             continue
-        by_goal = [successes(algo, change, goal, files[data], args.seed) for goal in TASKS]
-        print(variant, *by_goal, flush=True)
+        data, algo, change = VARIANTS[variant]
+        by_goal = [successes(algo, change, goal, files[data], seed) for goal in TASKS]
+        print(variant, seed, *by_goal, flush=True)
         said = ", ".join(f"{name}={value}" for name, value in change.items()) or "the defaults"
         for index, solved in enumerate(zip(*by_goal, strict=True), start=1):
             counts = {"successes": sum(solved), "episodes": N_EPISODES * len(TASKS)}
-            rows.append({"variant": variant, "change": f"{data}; {said}", "step": index * EVAL_FREQ, **counts})
+            labels = {"variant": variant, "change": f"{data}; {said}", "seed": seed}
+            rows.append({**labels, "step": index * EVAL_FREQ, **counts})
         with args.output.open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()

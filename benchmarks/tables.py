@@ -184,13 +184,16 @@ def expert_table(rows: list[dict[str, str]]) -> str:
 
 
 def checkpoint_table(rows: list[dict[str, str]]) -> str:
-    """A row a variant, a column a checkpoint."""
+    """A row a variant, a column a checkpoint; seeds are added up."""
     steps = sorted({int(row["step"]) for row in rows})
     lines = ["| variant | change | " + " | ".join(f"step {step}" for step in steps) + " |", "|---" * (2 + len(steps)) + "|"]
     for variant in dict.fromkeys(row["variant"] for row in rows):
-        own = {int(row["step"]): row for row in rows if row["variant"] == variant}
-        change = next(iter(own.values()))["change"]
-        cells = (f"{own[step]['successes']} of {own[step]['episodes']}" if step in own else "" for step in steps)
+        own = [row for row in rows if row["variant"] == variant]
+        change, cells = own[0]["change"], []
+        for step in steps:
+            here = [row for row in own if int(row["step"]) == step]
+            solved, episodes = (sum(int(row[name]) for row in here) for name in ("successes", "episodes"))
+            cells.append(f"{solved} of {episodes}" if here else "")
         lines.append(f"| {variant} | {f'`{change}`' if change else ''} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
