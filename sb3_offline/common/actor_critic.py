@@ -29,7 +29,6 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
     critic: OfflineCritic
     critic_target: OfflineCritic
     critic_parameters: list[th.Tensor]
-    head_parameters: list[th.Tensor]
     critic_target_parameters: list[th.Tensor]
     batch_norm_stats: list[th.Tensor]
     batch_norm_stats_target: list[th.Tensor]
@@ -41,7 +40,6 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         # Lists, since a walk through all modules in each step takes a while
         self.critic_parameters = list(self.critic.parameters())
         self.critic_target_parameters = list(self.critic_target.parameters())
-        self.head_parameters = [parameter for net in self.critic.q_networks for parameter in net.parameters()]
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
@@ -67,12 +65,13 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
         :param actions: ``(batch, action_dim)`` in [-1, 1]
         :return: ``(n_critics, batch)``
         """
-        for parameter in self.head_parameters:  # or their gradients would be computed and thrown away
+        held = [parameter for parameter in self.critic_parameters if parameter.requires_grad]  # what a user froze stays so
+        for parameter in held:  # or their gradients would be computed and thrown away
             parameter.requires_grad_(False)
         try:
             return self.critic.values(features.detach(), actions)
         finally:
-            for parameter in self.head_parameters:
+            for parameter in held:
                 parameter.requires_grad_(True)
 
     def _update_target(self) -> None:
@@ -84,8 +83,7 @@ class ActorCriticAlgorithm(OfflineAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         critics = [name + suffix for name in ("critic", "critic_target") for suffix in ("", "_parameters")]
-        others = ["head_parameters", "batch_norm_stats", "batch_norm_stats_target"]
-        return [*super()._excluded_save_params(), *critics, *others]
+        return [*super()._excluded_save_params(), *critics, "batch_norm_stats", "batch_norm_stats_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
