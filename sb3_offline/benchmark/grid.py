@@ -188,49 +188,47 @@ def plan(grid: Grid, runs: Path) -> dict[tuple[str, str, int], Run]:
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
+    configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in grid.methods.items()}
     cells: dict[tuple[str, str, int], Run] = {}
-    shared: dict[tuple[str, int], Run] = {}
     for seed in grid.seeds:
         for task in grid.tasks:
             for name, method in grid.methods.items():
-                if _depends_on_task(grid, method):
-                    run = _run(grid, name, seed, (task,), runs)
+                if _depends_on_task(grid, method, configs[name]):
+                    cells[name, task, seed] = _run(grid, name, configs[name], seed, task, runs)
                 else:
-                    run = shared.setdefault((name, seed), _run(grid, name, seed, tuple(grid.tasks), runs))
-                cells[name, task, seed] = run
+                    first = cells.get((name, grid.tasks[0], seed))
+                    cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, runs)
     return cells
 
 
-def _run(grid: Grid, name: str, seed: int, tasks: tuple[str, ...], runs: Path) -> Run:
-    method, of_task = grid.methods[name], len(tasks) == 1 and _depends_on_task(grid, grid.methods[name])
+def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | None, runs: Path) -> Run:
+    """
+    :param config: of the method
+    :param task: ``None`` for a run of all tasks
+    """
+    method, tasks = grid.methods[name], (task,) if task else tuple(grid.tasks)
     if _takes_examples(method) and grid.examples is None:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
-    config = _config(grid, method)
-    config["env_kwargs"] = {**config.get("env_kwargs", {}), **grid.env_kwargs}
+    env_kwargs = {**config.get("env_kwargs", {}), **grid.env_kwargs}
     arguments = {
         "algo": method.algo,
         "env_id": grid.env,
-        "config": {**config, "n_timesteps": grid.n_timesteps},
-        "output": _run_folder(runs, name, seed, tasks[0] if of_task else None),
+        "config": {**config, "env_kwargs": env_kwargs, "n_timesteps": grid.n_timesteps},
+        "output": _run_folder(runs, name, seed, task),
         "dataset": _filled(grid.dataset, tasks[0]),
         "examples": _filled(grid.examples, tasks[0]) if _takes_examples(method) else None,
-        "env_kwargs": {"task": tasks[0]} if of_task else {},
+        "env_kwargs": {"task": task} if task else {},
         "seed": seed,
     }
     return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tasks, arguments, grid)
-
-
-def _config(grid: Grid, method: Method) -> dict[str, Any]:
-    return merged(load_config(method.config, grid.env), method.changes)
 
 
 def _takes_examples(method: Method) -> bool:
     return issubclass(find_algorithm(method.algo), ExampleBasedAlgorithm)
 
 
-def _depends_on_task(grid: Grid, method: Method) -> bool:
+def _depends_on_task(grid: Grid, method: Method, config: dict[str, Any]) -> bool:
     """:return: whether a policy learns from anything that is another one for another task: examples, files, or episodes"""
-    config = _config(grid, method)
     texts = [grid.dataset, config.get("episodes"), grid.examples if _takes_examples(method) else None]
     return any("{task}" in str(text) for text in texts)
 

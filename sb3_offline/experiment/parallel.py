@@ -52,11 +52,10 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
     reports = context.Manager().Queue()
     bars: dict[str, tqdm] = {}
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
-        futures: set[Future] = {
+        running: set[Future] = {
             pool.submit(functools.partial(_run, label, arguments, reports)) for label, arguments in runs.items()
         }
         try:
-            running = futures
             while running:
                 done, running = wait(running, timeout=POLL_SECONDS)
                 _show(reports, bars, runs)
