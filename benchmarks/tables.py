@@ -72,9 +72,9 @@ def card_table(card: dict[str, Any]) -> str:
 def throughput_table(entries: list[dict[str, Any]]) -> str:
     """Three tables: beside peers, against the floor, and all other costs."""
     lines = ["| | ours, ms | peer | peer, ms | times as fast |", "|---" * 5 + "|"]
-    columns = "| | ms | floor, ms | GFLOP a step | GFLOP/s of a product | over the floor | SB3's SAC over the floor |"
+    columns = "| | ms | floor, ms | GFLOP a step | GFLOP/s of a product | over the floor | the peer over the floor |"
     floors = [columns, "|---" * 7 + "|"]
-    sac_ms = {e["name"].partition("_vs_sb3_sac")[0]: e["peer_ms"] for e in entries if e.get("peer") == "SB3 SAC"}
+    peers_ms = {e["name"].partition("_vs_")[0]: e["peer_ms"] for e in entries if e.get("peer") in ("SB3 SAC", "d3rlpy CQL")}
     others = ["| | ms | |", "|---" * 3 + "|"]
     for entry in entries:
         name, notes = f"`{entry['name']}`", []
@@ -85,7 +85,7 @@ def throughput_table(entries: list[dict[str, Any]]) -> str:
         elif "floor_ms" in entry:
             cells = [entry[key] for key in ("ours_ms", "floor_ms", "gflop", "gflop_per_second", "over_floor")]
             learner = entry["name"].removeprefix("floor_").removesuffix("_bf16")
-            cells.append(round(sac_ms[learner] / entry["floor_ms"], 2))
+            cells.append(round(peers_ms[learner] / entry["floor_ms"], 2))
             floors.append(f"| {name} | " + " | ".join(f"{cell:g}" for cell in cells) + " |")
         elif entry["name"] == "machine":
             others.append(f"| machine | | {entry['cpu']}, {entry['threads']} threads, torch {entry['torch']} |")

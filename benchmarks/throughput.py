@@ -153,10 +153,8 @@ def _linear_flop(x_shape: Any, weight_shape: Any, *args: Any, out_shape: Any = N
     return 2 * int(np.prod(x_shape)) * weight_shape[0]
 
 
-def floor_entry(name: str, step: Step, median_ms: float, mixed_precision: bool, n_bytes: int) -> dict[str, Any]:
-    """Operations of a step over the rate of a large product, and the batch's bytes over the rate of a copy."""
-    with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
-        step()
+def product_rate(mixed_precision: bool) -> float:
+    """:return: operations a second of one large product"""
     dtype = th.bfloat16 if mixed_precision else th.float32
     left, right = th.randn(4096, 256).to(dtype), th.randn(256, 256).to(dtype)
     product = (
@@ -164,8 +162,14 @@ def floor_entry(name: str, step: Step, median_ms: float, mixed_precision: bool, 
         if mixed_precision
         else (lambda: th.ops.mkldnn._linear_pointwise(left, right, None, "none", [], ""))
     )
+    return 2 * left.numel() * 256 / _fastest(product)
+
+
+def floor_entry(name: str, step: Step, median_ms: float, rate: float, n_bytes: int) -> dict[str, Any]:
+    """Operations of a step over the rate of a large product, and the batch's bytes over the rate of a copy."""
+    with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
+        step()
     source = np.random.default_rng(0).integers(0, 256, 1 << 26, np.uint8)
-    rate = 2 * left.numel() * 256 / _fastest(product)
     bandwidth = source.nbytes / _fastest(lambda: source.copy())
     floor = 1e3 * (counter.get_total_flops() / rate + n_bytes / bandwidth)
     return {
@@ -213,10 +217,12 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     for name in learners:
         entries.append(comparison(f"{name}_{kind}_bf16_vs_float32", times, f"{name}_bf16", name))
     row_bytes = int(np.prod(OBSERVATIONS[kind].shape)) * OBSERVATIONS[kind].dtype.itemsize
-    for suffix in ("", "_bf16"):
-        median = float(np.median(np.concatenate(times[f"ceborl{suffix}"])))
-        n_bytes = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)
-        entries.append(floor_entry(f"ceborl_{kind}{suffix}", steps[f"ceborl{suffix}"], median, bool(suffix), n_bytes))
+    n_bytes = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # CEBORL's; the others need no more
+    rates = {mixed_precision: product_rate(mixed_precision) for mixed_precision in (False, True)}
+    for name in learners:
+        for suffix, rate in zip(("", "_bf16"), rates.values(), strict=True):
+            median = float(np.median(np.concatenate(times[name + suffix])))
+            entries.append(floor_entry(f"{name}_{kind}{suffix}", steps[name + suffix], median, rate, n_bytes))
     return entries
 
 

@@ -91,6 +91,12 @@ def test_damage_is_named_by_file_field_and_remedy(tmp_path, damage, message):
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
+def test_file_that_its_user_has_open_too(tmp_path):
+    write_dataset(tmp_path / "d.h5")
+    with h5py.File(tmp_path / "d.h5") as file:
+        assert OfflineDataset(tmp_path / "d.h5").n_steps == len(file["actions"])
+
+
 @pytest.mark.parametrize("storage", ["contiguous", "compressed"])
 @pytest.mark.parametrize("state", [STATES, spaces.Box(-1, 1, (4, 3)), spaces.Box(-9, 9, (3, 4, 1))])
 def test_nan_in_states_is_found(tmp_path, monkeypatch, storage, state):

@@ -79,6 +79,8 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
     try:
         return h5py.File(path, "r", locking=False)
     except OSError as error:
+        if "file locking flag" in str(error):  # this process has it open with the lock; HDF5 wants all openings alike
+            return h5py.File(path, "r")
         if "truncated file" in str(error):
             raise DatasetError(path, "file", "is truncated", "Copy or download it again: its end is missing") from error
         problem = "cannot be read as HDF5 (" + str(error).strip() + ")"
