@@ -82,6 +82,8 @@ def make(algo, policy, files, env=None, **kwargs):
         kwargs = {"examples": examples, "example_batch_size": 4, **kwargs}
     if algo == "oril":
         kwargs = {"reward_steps": 3, **kwargs}
+    if policy != "MlpPolicy":
+        kwargs = {"random_shift": 2, **kwargs}
     small = {"net_arch": [16, 16]}
     if policy == "CnnPolicy":
         small["features_extractor_kwargs"] = {"features_dim": 16}

@@ -283,8 +283,8 @@ def test_images_given_to_an_mlp_are_only_scaled(dataset):
 def test_every_batch_of_images_is_shifted(dataset, monkeypatch):
     examples = make_observations(IMAGES, 4, np.random.default_rng(0))
     kwargs = {**SMALL, "features_extractor_kwargs": {"features_dim": 16}}
-    sizes_of_batches = {"batch_size": 8, "example_batch_size": 4}
-    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, policy_kwargs=kwargs, **sizes_of_batches)
+    kwargs = {"batch_size": 8, "example_batch_size": 4, "random_shift": 4, "policy_kwargs": kwargs}
+    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, **kwargs)
     sizes, augment = [], model.augment
     monkeypatch.setattr(model, "augment", lambda batch: sizes.append(len(batch)) or augment(batch))
     model.learn(1)

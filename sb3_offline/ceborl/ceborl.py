@@ -97,7 +97,7 @@ class CEBORL(ExampleBasedAlgorithm):
     :param policy_batches: the policy learns from the transitions of the last so many batches, drawn by their weights
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
-    :param random_shift: images are shifted by up to so many pixels
+    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -139,7 +139,7 @@ class CEBORL(ExampleBasedAlgorithm):
         policy_batches: int = 512,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
-        random_shift: int = 4,
+        random_shift: int = 0,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,

@@ -36,7 +36,7 @@ _REMEDIES = {
         "After {steps} steps the classifier tells all examples from each of {n_transitions} states of the data. Either the "
         "data hold no success, or it looks at something else: another camera, light, crop or preprocessing; other objects; "
         "entries of a vector that differ from episode to episode. Look at both side by side, and take the examples in the "
-        "set-up of the data. Keep random_shift=4 for images. For vectors raise the floor under the standard deviations: "
+        "set-up of the data. For images try random_shift=4. For vectors raise the floor under the standard deviations: "
         "policy_kwargs={{'features_extractor_kwargs': {{'std_min': 0.1}}}}"
     ),
     "weights_collapsed": (

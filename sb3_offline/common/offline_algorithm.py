@@ -69,7 +69,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         gamma: float = 0.99,
         n_steps: int = 1,
         target_update_interval: int = 1,
-        random_shift: int = 4,
+        random_shift: int = 0,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,

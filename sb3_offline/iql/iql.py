@@ -35,7 +35,7 @@ class IQL(RewardBasedAlgorithm):
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param reward_fn: rewards in place of the dataset's, see
         :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
-    :param random_shift: images are shifted by up to so many pixels
+    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -61,7 +61,7 @@ class IQL(RewardBasedAlgorithm):
         weight_max: float = 100.0,
         target_update_interval: int = 1,
         reward_fn: RewardFunction | None = None,
-        random_shift: int = 4,
+        random_shift: int = 0,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,

@@ -36,7 +36,7 @@ class TD3BC(RewardBasedAlgorithm):
     :param target_noise_clip: bound of that noise
     :param reward_fn: rewards in place of the dataset's, see
         :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
-    :param random_shift: images are shifted by up to so many pixels
+    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -71,7 +71,7 @@ class TD3BC(RewardBasedAlgorithm):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         reward_fn: RewardFunction | None = None,
-        random_shift: int = 4,
+        random_shift: int = 0,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
