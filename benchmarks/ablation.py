@@ -1,5 +1,5 @@
 """
-One change at a time from CEBORL's defaults, on state observations: what each part of the working form is worth.
+One change at a time from CEBORL's config, on state observations: what each part of the working form is worth.
 
     sb3-offline collect-sac data/sac_states.h5 --examples data/sac_states_examples
     python benchmarks/ablation.py
@@ -37,6 +37,7 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "penalty on logits": {"penalty_space": "logit"},
         "mu: half policy, half uniform": {"mu": "mixture"},
         "mu: policy": {"mu": "policy"},
+        "16 sampled actions": {"n_action_samples": 16},
     },
     "odds": {
         "class prior 0.1": {"class_prior": 0.1},
@@ -47,6 +48,8 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "no examples among the data": {"example_share": 0.0},
     },
     "backup": {
+        "gamma = 0.9": {"gamma": 0.9},
+        "gamma = 0.99": {"gamma": 0.99},
         "1-step omega": {"n_steps": 1},
         "3-step omega": {"n_steps": 3},
         "30-step omega": {"n_steps": 30},

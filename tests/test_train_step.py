@@ -149,8 +149,8 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
 
 
 def test_paper_form(dataset, monkeypatch):
-    form = {**PAPER_FORM, "ent_coef": 0.05, "n_action_samples": 5}
-    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, gamma=GAMMA, seed=0, policy_kwargs=SMALL, **form)
+    form = {**PAPER_FORM, "gamma": GAMMA, "ent_coef": 0.05, "n_action_samples": 5}
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, policy_kwargs=SMALL, **form)
     reading = Reading(model, monkeypatch)
     batch, examples = reading.batch, reading.examples
     next_actions = reading.mode(batch.next_observations)
