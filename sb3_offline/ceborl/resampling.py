@@ -18,25 +18,43 @@ class WeightedTransitions:
 
     def __init__(self, n_batches: int):
         self.n_batches = n_batches
-        self.steps: list[th.Tensor] = []
-        self.weights: list[th.Tensor] = []
+        self._n_added = 0
+        # Rings of batches, made when their size is known
+        self._steps = th.empty(0, 0, dtype=th.int64)
+        self._weights = th.empty(0, 0)
+
+    @property
+    def steps(self) -> th.Tensor:
+        """(kept batches, batch) int64, numbers of the transitions in the dataset, in no particular order of batches"""
+        return self._steps[: self._n_added]
+
+    @property
+    def weights(self) -> th.Tensor:
+        """(kept batches, batch) of the transitions"""
+        return self._weights[: self._n_added]
 
     def add(self, steps: th.Tensor, weights: th.Tensor) -> None:
         """
-        :param steps: (batch,) int64 on the CPU, numbers of the transitions in the dataset
+        :param steps: (batch,) int64 on the CPU, numbers of the transitions in the dataset; batches of another size than
+            before start anew
         :param weights: ``(batch,)``, positive, no gradient
         """
-        self.steps = [*self.steps, steps][-self.n_batches :]
-        self.weights = [*self.weights, weights][-self.n_batches :]
+        if len(steps) != self._steps.shape[1]:
+            self._n_added = 0
+            self._steps = steps.new_empty(self.n_batches, len(steps))
+            self._weights = weights.new_empty(self.n_batches, len(steps))
+        row = self._n_added % self.n_batches
+        self._steps[row], self._weights[row] = steps, weights
+        self._n_added += 1
 
     def draw(self, n: int) -> np.ndarray:
         """
         :param n: how many
         :return: (n,) numbers of transitions, with replacement
         """
-        drawn = th.multinomial(th.cat(self.weights), n, replacement=True)
-        return th.cat(self.steps)[drawn.cpu()].numpy()
+        drawn = th.multinomial(self.weights.flatten(), n, replacement=True)
+        return self.steps.flatten()[drawn.cpu()].numpy()
 
     def effective_share(self) -> th.Tensor:
         """:return: scalar, the part of the transitions that would carry as much if all had the same weight"""
-        return effective_share(th.cat(self.weights))
+        return effective_share(self.weights.flatten())
