@@ -217,11 +217,13 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     for name in learners:
         entries.append(comparison(f"{name}_{kind}_bf16_vs_float32", times, f"{name}_bf16", name))
     row_bytes = int(np.prod(OBSERVATIONS[kind].shape)) * OBSERVATIONS[kind].dtype.itemsize
-    n_bytes = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # CEBORL's; the others need no more
+    example_based = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # CEBORL's; read and written
+    others = 2 * row_bytes * 2 * BATCH_SIZE
     rates = {mixed_precision: product_rate(mixed_precision) for mixed_precision in (False, True)}
     for name in learners:
         for suffix, rate in zip(("", "_bf16"), rates.values(), strict=True):
             median = float(np.median(np.concatenate(times[name + suffix])))
+            n_bytes = example_based if name in ("ceborl", "in_sample", "rce") else others
             entries.append(floor_entry(f"{name}_{kind}{suffix}", steps[name + suffix], median, rate, n_bytes))
     return entries
 

@@ -91,9 +91,10 @@ def test_damage_is_named_by_file_field_and_remedy(tmp_path, damage, message):
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_file_that_its_user_has_open_too(tmp_path):
+@pytest.mark.parametrize("locking", [None, True, False])
+def test_file_that_its_user_has_open_too(tmp_path, locking):
     write_dataset(tmp_path / "d.h5")
-    with h5py.File(tmp_path / "d.h5") as file:
+    with h5py.File(tmp_path / "d.h5", locking=locking) as file:
         assert OfflineDataset(tmp_path / "d.h5").n_steps == len(file["actions"])
 
 

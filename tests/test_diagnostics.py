@@ -65,7 +65,11 @@ def test_a_bound_of_omega_that_is_too_low_is_told(dataset):
 def test_weights_that_are_too_sharp_are_told(dataset):
     sharp = {"temperature": 0.02, "weight_max": 1e17, "learning_rate": 3e-3}
     _, messages = learn(dataset, 100, DiagnosticsCallback(check_freq=20), **sharp)
-    assert len(messages) == 1 and "of a batch of 128" in messages[0] and "Raise temperature (now 0.02)" in messages[0]
+    assert (
+        len(messages) == 1
+        and "of the 2560 that it draws from" in messages[0]
+        and "Raise temperature (now 0.02)" in messages[0]
+    )
 
 
 def test_what_is_measured_is_logged(dataset):

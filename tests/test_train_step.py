@@ -148,6 +148,17 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
     assert kept.effective_share().item() == pytest.approx(0.8)
 
 
+def test_with_another_dataset_no_transitions_of_the_old_one_are_drawn(dataset, tmp_path):
+    write_dataset(tmp_path / "small.h5", 2, STATES)
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, batch_size=64, policy_kwargs=SMALL).learn(3)
+    kept = model._weighted_transitions.steps
+    model.learn(1)
+    assert model._weighted_transitions.steps.shape == (4, 64) and th.equal(model._weighted_transitions.steps[:3], kept)
+    model.dataset = tmp_path / "small.h5"
+    model.learn(1)
+    assert model._weighted_transitions.steps.max() < model.replay_buffer.size() and len(model._weighted_transitions.steps) == 1
+
+
 def test_paper_form(dataset, monkeypatch):
     form = {**PAPER_FORM, "gamma": GAMMA, "ent_coef": 0.05, "n_action_samples": 5}
     model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, policy_kwargs=SMALL, **form)

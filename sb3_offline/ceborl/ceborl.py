@@ -72,7 +72,7 @@ class CEBORL(ExampleBasedAlgorithm):
     :param example_batch_size: Success examples in a batch
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor. What the classifier mistakes for success lives on in the odds by it: where attempts are
-        short (50 steps in the shipped configs), 0.95 told success apart better than 0.99
+        short (50 steps in the shipped environment), try 0.95
     :param n_steps: omega is the mean of the 1-step and the n-step odds, discounted (1: the 1-step odds alone)
     :param beta: weight of the conservative penalty (a)
     :param n_action_samples: K, actions drawn from mu at each state
@@ -190,6 +190,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.weight_max = weight_max
         self.state_exponent = state_exponent
         self._weighted_transitions = WeightedTransitions(policy_batches)
+        self._n_dataset_steps = 0
         self.ent_coef = ent_coef
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
@@ -206,6 +207,13 @@ class CEBORL(ExampleBasedAlgorithm):
         if self.policy_extraction == "weighted":
             self.policy_kwargs.setdefault("std_min", 0.05)
         super()._setup_model()
+
+    def _prepare_data(self) -> None:
+        super()._prepare_data()
+        n_steps = self.replay_buffer.size()
+        if n_steps != self._n_dataset_steps:  # the numbers of kept transitions are of another dataset
+            self._weighted_transitions = WeightedTransitions(self._weighted_transitions.n_batches)
+            self._n_dataset_steps = n_steps
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)

@@ -13,7 +13,7 @@ from sb3_offline.ceborl.ceborl import CEBORL
 SATURATED_CLASSIFIER, SATURATED_SHARE = 0.99, 0.5
 ON_BOUNDS, COLLAPSED_SHARE = 0.98, 0.5
 CLIPPED_SHARE = 0.01
-EFFECTIVE_TRANSITIONS = 1
+EFFECTIVE_TRANSITIONS = 100
 
 _REMEDIES = {
     "classifier_saturated": (
@@ -40,8 +40,8 @@ _REMEDIES = {
         "policy_kwargs={{'features_extractor_kwargs': {{'std_min': 0.1}}}}"
     ),
     "weights_collapsed": (
-        "The policy imitates as much as {effective_transitions:.1f} transitions of a batch of {batch_size}: its weights are "
-        "too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower weight_max"
+        "The policy imitates as much as {effective_transitions:.0f} transitions of the {n_kept} that it draws from: its weights "
+        "are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower weight_max"
     ),
 }
 
@@ -73,7 +73,6 @@ class DiagnosticsCallback(BaseCallback):
         self.check_freq, self.n_transitions, self.early_steps = check_freq, n_transitions, early_steps
         self.warned: set[str] = set()
         self._rng = np.random.default_rng(0)
-        self._weights_seen: tuple[th.Tensor, int] = (th.zeros(()), 0)
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, CEBORL):
@@ -116,16 +115,11 @@ class DiagnosticsCallback(BaseCallback):
         actions = th.tanh(mean)
         return actions, self.model.critic.values(features, actions).mean(dim=0).float()
 
-    def _effective_weights(self) -> float:
-        """:return: effective share of a batch in the weighted regression, a mean since the last look or log dump"""
-        total, count = self.model._metrics.get("effective_weights", (th.zeros(()), 0))
-        last_total, last_count = self._weights_seen if self._weights_seen[1] <= count else (th.zeros(()), 0)
-        self._weights_seen = total, count
-        return float(total - last_total) / (count - last_count) if count > last_count else 1.0
-
     def _judge(self, found: dict[str, float]) -> None:
         more = found["actions_on_bounds"] - found["data_actions_on_bounds"]
-        effective_transitions = self._effective_weights() * self.model.batch_size
+        kept = self.model._weighted_transitions
+        n_kept = kept.weights.numel()
+        effective_transitions = float(kept.effective_share()) * n_kept if n_kept else math.inf
         wrong = {
             "classifier_saturated": found["classifier_saturated"] > SATURATED_SHARE,
             "omega_clipped": found["omega_clipped"] > CLIPPED_SHARE,
@@ -135,9 +129,10 @@ class DiagnosticsCallback(BaseCallback):
         }
         about = {
             **found,
-            **{name: getattr(self.model, name) for name in ("omega_max", "temperature", "advantage_floor", "batch_size")},
+            **{name: getattr(self.model, name) for name in ("omega_max", "temperature", "advantage_floor")},
             "saturated": SATURATED_CLASSIFIER,
             "effective_transitions": effective_transitions,
+            "n_kept": n_kept,
             "steps": self.num_timesteps,
             "n_transitions": self.n_transitions,
         }

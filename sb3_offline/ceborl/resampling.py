@@ -1,5 +1,7 @@
 """Batches in which no transition is drawn in vain."""
 
+from typing import Any
+
 import numpy as np
 import torch as th
 
@@ -17,6 +19,8 @@ class WeightedTransitions:
     """
 
     def __init__(self, n_batches: int):
+        if n_batches < 1:
+            raise ValueError(f"The policy has to learn from one batch at least, not from policy_batches={n_batches}")
         self.n_batches = n_batches
         self._n_added = 0
         # Rings of batches, made when their size is known
@@ -41,11 +45,15 @@ class WeightedTransitions:
         """
         if len(steps) != self._steps.shape[1]:
             self._n_added = 0
-            self._steps = steps.new_empty(self.n_batches, len(steps))
-            self._weights = weights.new_empty(self.n_batches, len(steps))
+            self._steps = steps.new_zeros(self.n_batches, len(steps))
+            self._weights = weights.new_zeros(self.n_batches, len(steps))
+        self._weights = self._weights.to(weights.device)  # a model that was loaded has them on the CPU
         row = self._n_added % self.n_batches
         self._steps[row], self._weights[row] = steps, weights
         self._n_added += 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_weights": self._weights.cpu()}  # a saved model loads where there is no such device
 
     def draw(self, n: int) -> np.ndarray:
         """

@@ -1,4 +1,4 @@
-"""Random shifts of images, the augmentation that learning from pixels needs."""
+"""Random shifts of images."""
 
 import numpy as np
 import torch as th
