@@ -40,8 +40,9 @@ _REMEDIES = {
         "policy_kwargs={{'features_extractor_kwargs': {{'std_min': 0.1}}}}"
     ),
     "weights_collapsed": (
-        "The policy imitates as much as {effective_transitions:.0f} transitions of the {n_kept} that it draws from: its weights "
-        "are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower weight_max"
+        "The policy imitates as much as {effective_transitions:.0f} transitions of the {n_kept} that it draws from: its "
+        "weights are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower "
+        "weight_max"
     ),
 }
 
