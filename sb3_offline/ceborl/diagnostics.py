@@ -41,8 +41,8 @@ _REMEDIES = {
     ),
     "weights_collapsed": (
         "The policy imitates as much as {effective_transitions:.0f} transitions of the {n_kept} that it draws from: its "
-        "weights are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or lower "
-        "weight_max"
+        "weights are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or "
+        "lower weight_max"
     ),
 }
 
