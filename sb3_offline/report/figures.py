@@ -83,7 +83,7 @@ def plot_strips(episodes: Mapping[str, PlayedEpisode], title: str, path: Path) -
 
     :param episodes: of each method
     :param title: what they have in common
-    :param path: of the PNG
+    :param path: of the picture
     """
     size = (1.15 * N_PICTURES + 1.2, 1.32 * len(episodes) + 0.5)
     figure, panels = plt.subplots(len(episodes), N_PICTURES, figsize=size, squeeze=False, layout="constrained")
