@@ -129,7 +129,7 @@ def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
     run_benchmark(tmp_path, write_grid(tmp_path, data, n_timesteps=4), *options)
     cli.main(["report", str(tmp_path / "table.csv"), "-o", str(tmp_path / "report"), "--runs", str(tmp_path / "runs")])
     text = (tmp_path / "report/report.md").read_text()
-    for name in ("table_door-open.png", "table_values.png"):
+    for name in ("table_door-open.jpg", "table_values.png"):
         with Image.open(tmp_path / "report" / name) as picture:
             assert picture.width > 200 and name in text
 
