@@ -165,13 +165,17 @@ def product_rate(mixed_precision: bool) -> float:
     return 2 * left.numel() * 256 / _fastest(product)
 
 
-def floor_entry(name: str, step: Step, median_ms: float, rate: float, n_bytes: int) -> dict[str, Any]:
-    """Operations of a step over the rate of a large product, and the batch's bytes over the rate of a copy."""
+def copy_rate() -> float:
+    """:return: bytes a second of one large copy"""
+    source = np.random.default_rng(0).integers(0, 256, 1 << 26, np.uint8)
+    return source.nbytes / _fastest(lambda: source.copy())
+
+
+def floor_entry(name: str, step: Step, median_ms: float, rate: float, copy_seconds: float) -> dict[str, Any]:
+    """Operations of a step over the rate of a large product, and the time that copying the batch takes."""
     with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
         step()
-    source = np.random.default_rng(0).integers(0, 256, 1 << 26, np.uint8)
-    bandwidth = source.nbytes / _fastest(lambda: source.copy())
-    floor = 1e3 * (counter.get_total_flops() / rate + n_bytes / bandwidth)
+    floor = 1e3 * (counter.get_total_flops() / rate + copy_seconds)
     return {
         "name": f"floor_{name}",
         "ours_ms": round(median_ms, 2),
@@ -219,12 +223,12 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     row_bytes = int(np.prod(OBSERVATIONS[kind].shape)) * OBSERVATIONS[kind].dtype.itemsize
     example_based = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # CEBORL's; read and written
     others = 2 * row_bytes * 2 * BATCH_SIZE
-    rates = {mixed_precision: product_rate(mixed_precision) for mixed_precision in (False, True)}
+    rates, bandwidth = {"": product_rate(False), "_bf16": product_rate(True)}, copy_rate()
     for name in learners:
-        for suffix, rate in zip(("", "_bf16"), rates.values(), strict=True):
+        copy_seconds = (example_based if name in ("ceborl", "in_sample", "rce") else others) / bandwidth
+        for suffix, rate in rates.items():
             median = float(np.median(np.concatenate(times[name + suffix])))
-            n_bytes = example_based if name in ("ceborl", "in_sample", "rce") else others
-            entries.append(floor_entry(f"{name}_{kind}{suffix}", steps[name + suffix], median, rate, n_bytes))
+            entries.append(floor_entry(f"{name}_{kind}{suffix}", steps[name + suffix], median, rate, copy_seconds))
     return entries
 
 

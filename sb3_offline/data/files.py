@@ -77,16 +77,14 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
     if not os.path.isfile(path):
         raise DatasetError(path, "file", "does not exist", "Check the path")
     try:
-        try:
-            return h5py.File(path, "r", locking=False)
-        except OSError as error:
-            if "file locking" not in str(error):
-                raise
+        for locking in (False, None):
+            try:
+                return h5py.File(path, "r", locking=locking)
+            except OSError as error:
+                if "file locking" not in str(error):
+                    raise
         # This process has it open with the lock, and HDF5 wants all openings alike.
-        try:
-            return h5py.File(path, "r")
-        except OSError:
-            return h5py.File(path, "r", locking=True)
+        return h5py.File(path, "r", locking=True)
     except OSError as error:
         if "truncated file" in str(error):
             raise DatasetError(path, "file", "is truncated", "Copy or download it again: its end is missing") from error
