@@ -20,7 +20,6 @@ from sb3_offline import cli
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, current_commit, train_run
-from sb3_offline.experiment import policy_file
 from sb3_offline.experiment.policy_file import load_policy
 from sb3_offline.experiment.training import RESUME_FILE, load_run
 
@@ -100,7 +99,7 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["wrong"] * 2 + ["bc"] * 2
 
 
-def test_what_no_task_decides_is_trained_once(data, tmp_path, monkeypatch):
+def test_what_no_task_decides_is_trained_once(data, tmp_path):
     grid = write_grid(tmp_path, data)
     rows = run_benchmark(tmp_path, grid, "--methods", "bc")
     assert [(row["task"], row["step"]) for row in rows] == [(task, step) for task in GRID["tasks"] for step in ("30", "40")]
@@ -117,15 +116,9 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path, monkeypatch):
     policy, config = load_policy(small)
     model, _ = load_run(tmp_path / "runs/bc/seed3/model.zip")
     observations = np.random.default_rng(0).normal(size=(5, *model.observation_space.shape)).astype(np.float32)
-    actions = model.predict(observations, deterministic=True)[0]
-    assert (policy.predict(observations, deterministic=True)[0] == actions).all()
-    assert config["env"] == GRID["env"] and small.stat().st_size < 1_000_000
-
-    monkeypatch.setattr(policy_file, "FULL_PRECISION_BYTES", 0)
-    policy_file.save_policy(tmp_path / "bytes.npz", model, config)
-    assert (tmp_path / "bytes.npz").stat().st_size < small.stat().st_size / 3
-    actions_of_bytes = load_policy(tmp_path / "bytes.npz")[0].predict(observations, deterministic=True)[0]
-    np.testing.assert_allclose(actions_of_bytes, actions, atol=0.05)
+    actions, of_small = (player.predict(observations, deterministic=True)[0] for player in (model, policy))
+    np.testing.assert_allclose(of_small, actions, atol=0.05)  # its weights are rounded
+    assert config["env"] == GRID["env"] and small.stat().st_size < 100_000
 
 
 def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):

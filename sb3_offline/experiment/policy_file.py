@@ -15,8 +15,6 @@ from sb3_offline.data.files import replacing
 from sb3_offline.data.spaces import space_from_json, space_to_json
 from sb3_offline.experiment.training import create_model
 
-#: Of more bytes than this, matrices are kept with a byte a weight, as multiples of a unit that each row has.
-FULL_PRECISION_BYTES = 1_000_000
 _DESCRIPTION = "description"
 _UNIT = ":unit"
 _KEPT = ("algo", "env", "env_kwargs", "seed", "n_timesteps", "policy", "policy_kwargs")
@@ -24,15 +22,16 @@ _KEPT = ("algo", "env", "env_kwargs", "seed", "n_timesteps", "policy", "policy_k
 
 def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> None:
     """
+    Matrices are kept with a byte a weight, as multiples of a unit that each row has: a quarter of their size.
+
     :param path: of the ``.npz`` file
     :param model: whose actor is kept
     :param config: of its run, as :func:`~sb3_offline.experiment.training.load_run` returns it
     """
     weights = {name: value.cpu().numpy() for name, value in model.actor.state_dict().items()}
-    if sum(array.nbytes for array in weights.values()) > FULL_PRECISION_BYTES:
-        for name in [name for name, parameter in model.actor.named_parameters() if parameter.dim() > 1]:
-            unit = np.abs(weights[name]).max(axis=tuple(range(1, weights[name].ndim)), keepdims=True).clip(1e-12) / 127
-            weights[name], weights[name + _UNIT] = (weights[name] / unit).round().astype(np.int8), unit
+    for name in [name for name, parameter in model.actor.named_parameters() if parameter.dim() > 1]:
+        unit = np.abs(weights[name]).max(axis=tuple(range(1, weights[name].ndim)), keepdims=True).clip(1e-12) / 127
+        weights[name], weights[name + _UNIT] = (weights[name] / unit).round().astype(np.int8), unit
     description = {
         **{key: config[key] for key in _KEPT if key in config},
         "observation_space": space_to_json(model.observation_space),
@@ -46,7 +45,7 @@ def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> 
 def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
     """
     :param path: of a file of :func:`save_policy`
-    :return: a policy that plays as the model did (a large one: nearly so), whose critic is no one's; and the config of its run
+    :return: a policy that plays nearly as the model did, whose critic is no one's; and the config of its run
     """
     try:
         with np.load(path) as file:
