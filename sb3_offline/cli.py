@@ -179,7 +179,13 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument(
         "--runs", type=Path, required=True, help="folder of the runs; what is finished or saved there is taken up"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="CSV file, written anew after every run")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        help="CSV file, written anew after every run; of cells that were not asked for, rows stay",
+    )
     parser.add_argument("--workers", type=int, help="runs at once, one thread each (default: as many as there are cores)")
     parser.add_argument("--ray-address", help='train on a Ray cluster that shares the file system ("auto", "local")')
     parser.add_argument("--methods", nargs="+", help="some of the grid's only")
@@ -201,8 +207,9 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
             from sb3_offline.benchmark.local import train_locally
 
             train = functools.partial(train_locally, n_workers=args.workers or os.cpu_count() or 1)
-        grid = load_grid(args.grid).part(args.methods, args.tasks, args.seeds)
-        for line in run_grid(grid, args.runs, args.output, train):
+        whole = load_grid(args.grid)
+        grid = whole.part(args.methods, args.tasks, args.seeds)
+        for line in run_grid(grid, args.runs, args.output, train, whole=whole):
             print(line, flush=True)
         if args.policies:
             print(f"{export_policies(grid, args.runs, args.policies)} policies -> {args.policies}")

@@ -11,17 +11,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from PIL import Image
+from stable_baselines3.common.callbacks import BaseCallback
 
 pytest.importorskip("metaworld")
 
 from grids import GRID, assert_same, collect_data, rows_of, write_grid
 
 from sb3_offline import cli
+from sb3_offline.benchmark import local
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, current_commit, train_run
 from sb3_offline.experiment.policy_file import load_policy
-from sb3_offline.experiment.training import RESUME_FILE, load_run
+from sb3_offline.experiment.training import RESUME_FILE, load_run, train
 
 TABLE = "evaluations-door-open.csv"
 
@@ -68,6 +70,32 @@ def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
         assert [file.name for file in sorted(one.folder.iterdir())] == [file.name for file in sorted(other.folder.iterdir())]
 
 
+class _Interruption(BaseCallback):
+    """Stops a run at a step, or notes where it begins."""
+
+    def __init__(self, step):
+        super().__init__()
+        self.step, self.began = step, -1
+
+    def _on_training_start(self):
+        self.began = self.num_timesteps
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_a_run_goes_on_from_its_last_save(data, tmp_path):
+    (run,) = plan(load_grid(write_grid(tmp_path, data)).part(["ceborl"], ["door-open"]), tmp_path / "runs").values()
+    stops, goes_on = _Interruption(28), _Interruption(None)
+    arguments = {**run.arguments, "save_freq": run.grid.save_freq, "progress_bar": False}
+    with pytest.raises(KeyboardInterrupt):
+        train(**arguments, callbacks=[stops])
+    train(**arguments, callbacks=[goes_on])
+    assert (stops.began, goes_on.began) == (0, 25)
+
+
 def test_a_run_that_goes_on_with_other_code_says_so(tmp_path):
     provenance = _Provenance(tmp_path / "provenance.json")
     for step, before, expected in ((5, "a", "a then NOW"), (5, "a then NOW", "a then NOW"), (0, "a", "NOW")):
@@ -83,20 +111,25 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     options = ["--methods", "wrong", "bc", "ceborl", "--tasks", "door-open"]
     rows = run_benchmark(tmp_path, grid, *options)
     assert [(row["method"], row["step"], row["episodes"]) for row in rows] == [
-        (name, step, "1") for name in ("wrong", "bc", "ceborl") for step in ("30", "40")
+        (name, step, "1") for name in ("bc", "ceborl", "wrong") for step in ("30", "40")
     ]
-    assert all(row["config"].startswith("bc batch_size=many (failed: ") and row["successes"] == "0" for row in rows[:2])
-    assert rows[2]["config"] == "bc" and rows[2]["commit"] and rows[2]["versions"].startswith("torch ")
+    assert all(row["config"].startswith("bc batch_size=many (failed: ") and row["successes"] == "0" for row in rows[4:])
+    assert rows[0]["config"] == "bc" and rows[0]["commit"] and rows[0]["versions"].startswith("torch ")
     model = tmp_path / "runs/ceborl/door-open-seed3/model.zip"
     before = model.stat().st_mtime_ns
     again = run_benchmark(tmp_path, grid, *options)
     for row in [*rows, *again]:
         del row["commit"]  # the failed run was tried again, perhaps on another one
     assert again == rows and model.stat().st_mtime_ns == before
+    # A part of the grid leaves the rows of the others
+    part = run_benchmark(tmp_path, grid, "--no-training", "--methods", "bc", "--tasks", "door-open")
+    for row in part:
+        del row["commit"]
+    assert part == rows
     # Other hyperparameters are another run: the table has it when it is there
     methods["ceborl"] = {**methods["ceborl"], "changes": {"batch_size": 5}}
     grid = write_grid(tmp_path, data, methods=methods)
-    assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["wrong"] * 2 + ["bc"] * 2
+    assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["bc"] * 2 + ["wrong"] * 2
 
 
 def test_what_no_task_decides_is_trained_once(data, tmp_path):
@@ -119,6 +152,34 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path):
     actions, of_small = (player.predict(observations, deterministic=True)[0] for player in (model, policy))
     np.testing.assert_allclose(of_small, actions, atol=0.05)  # its weights are rounded
     assert config["env"] == GRID["env"] and small.stat().st_size < 100_000
+
+
+def test_a_run_of_all_tasks_keeps_no_evaluation_of_an_earlier_one(data, tmp_path):
+    for rate, tasks in ((1e-4, GRID["tasks"]), (1e-2, ["door-open"])):
+        methods = {"bc": {"algo": "bc", "config": "bc", "changes": {"learning_rate": rate}}}
+        rows = run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods), "--tasks", *tasks)
+    rows = run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods), "--no-training")
+    assert rows == []  # for the other task it has to be trained again
+
+
+def test_a_process_that_dies_again_and_again_is_a_failure(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "_work", _die)
+    rows = run_benchmark(tmp_path, write_grid(tmp_path, data), "--methods", "bc", "--tasks", "door-open")
+    assert len(rows) == 2 and all("its process died 3 times, with exit code 7" in row["config"] for row in rows)
+
+
+def _die(run):
+    os._exit(7)
+
+
+def test_a_method_may_have_data_of_its_own(data, tmp_path):
+    own = {"dataset": "pictures.h5", "examples": "pictures_{task}.h5"}
+    methods = {name: {"algo": "ceborl", "config": "ceborl", "changes": changes} for name, changes in (("a", {}), ("b", own))}
+    cells = plan(load_grid(write_grid(tmp_path, data, methods=methods)), tmp_path / "runs")
+    for name, expected in (("a", data), ("b", own)):
+        arguments = cells[name, "door-open", 3].arguments
+        assert arguments["dataset"] == expected["dataset"]
+        assert arguments["examples"] == expected["examples"].replace("{task}", "door-open")
 
 
 def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):

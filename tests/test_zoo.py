@@ -38,7 +38,7 @@ TestZoo-v0:
   examples: goal_{goal}.npy
   env_kwargs: {goal: 1, colour: blue}
   batch_size: 8
-  policy_kwargs: dict(net_arch=[8])
+  policy_kwargs: dict(net_arch=[8], n_critics=3)
   normalize: true
 """
 TRAIN = "--algo ceborl --env TestZoo-v0 --conf-file my.yml --env-kwargs goal:2 --seed 1 --eval-episodes 2".split()
@@ -61,6 +61,7 @@ gym.register("TestZoo-v0", entry_point=Watched)
 def run(tmp_path, monkeypatch):
     """Runs a program in a folder with a small dataset, examples of two goals and a config."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(HYPERPARAMS_SAMPLER, "ceborl", HYPERPARAMS_SAMPLER["ceborl"])  # a study adds a config's policy_kwargs
     write_point_mass("points.h5", n_episodes=10)
     write_dataset(tmp_path / "others.h5", 3, STATES)
     for goal in (1, 2):
@@ -112,7 +113,11 @@ def test_optuna_study(run, tmp_path):
 
     run(train.main, *TRAIN, "-n", "1", "--eval-freq", "-1", *stored, "--trial-id", "2")
     latest = max((tmp_path / "logs/ceborl").glob("TestZoo-v0_*/TestZoo-v0.zip"))
-    assert CEBORL.load(latest).beta == float(rows[2]["params_beta"])
+    model = CEBORL.load(latest)
+    assert model.beta == float(rows[2]["params_beta"])
+    sampled = HYPERPARAMS_SAMPLER["ceborl"](optuna.create_study().ask(), 2, 1, {})
+    for policy_kwargs in (model.policy_kwargs, sampled["policy_kwargs"]):  # what the config says, with another network
+        assert policy_kwargs["n_critics"] == 3 and policy_kwargs["net_arch"] != [8]
 
 
 @pytest.mark.parametrize(

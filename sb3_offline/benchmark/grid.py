@@ -88,6 +88,13 @@ class Grid:
         chosen["methods"] = {name: self.methods[name] for name in chosen["methods"]}
         return replace(self, **chosen)
 
+    def cells(self) -> list[tuple[str, str, int]]:
+        """
+        :return: method, task and seed of each cell. Seeds are outermost, so that a grid that was stopped early is one of fewer
+            seeds.
+        """
+        return [(name, task, seed) for seed in self.seeds for task in self.tasks for name in self.methods]
+
     def evaluation_steps(self) -> list[int]:
         """:return: steps of the checkpoints that count"""
         spacing = self.n_timesteps // (2 * self.checkpoints)
@@ -182,22 +189,19 @@ def plan(grid: Grid, runs: Path) -> dict[tuple[str, str, int], Run]:
     """
     :param grid: what is asked for
     :param runs: folder of all runs
-    :return: method, task and seed of each cell to the run that fills it. Seeds are outermost, so that a grid that was stopped
-        early is one of fewer seeds.
+    :return: of each of the grid's cells, the run that fills it
     """
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
     configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in grid.methods.items()}
     cells: dict[tuple[str, str, int], Run] = {}
-    for seed in grid.seeds:
-        for task in grid.tasks:
-            for name, method in grid.methods.items():
-                if _depends_on_task(grid, method, configs[name]):
-                    cells[name, task, seed] = _run(grid, name, configs[name], seed, task, runs)
-                else:
-                    first = cells.get((name, grid.tasks[0], seed))
-                    cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, runs)
+    for name, task, seed in grid.cells():
+        if _depends_on_task(grid, grid.methods[name], configs[name]):
+            cells[name, task, seed] = _run(grid, name, configs[name], seed, task, runs)
+        else:
+            first = cells.get((name, grid.tasks[0], seed))
+            cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, runs)
     return cells
 
 
@@ -207,7 +211,8 @@ def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | N
     :param task: ``None`` for a run of all tasks
     """
     method, tasks = grid.methods[name], (task,) if task else tuple(grid.tasks)
-    if _takes_examples(method) and grid.examples is None:
+    dataset, examples = _data(grid, method)
+    if _takes_examples(method) and examples is None:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
     env_kwargs = {**config.get("env_kwargs", {}), **grid.env_kwargs}
     arguments = {
@@ -215,8 +220,8 @@ def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | N
         "env_id": grid.env,
         "config": {**config, "env_kwargs": env_kwargs, "n_timesteps": grid.n_timesteps},
         "output": _run_folder(runs, name, seed, task),
-        "dataset": _filled(grid.dataset, tasks[0]),
-        "examples": _filled(grid.examples, tasks[0]) if _takes_examples(method) else None,
+        "dataset": _filled(dataset, tasks[0]),
+        "examples": _filled(examples, tasks[0]),
         "env_kwargs": {"task": task} if task else {},
         "seed": seed,
     }
@@ -229,8 +234,13 @@ def _takes_examples(method: Method) -> bool:
 
 def _depends_on_task(grid: Grid, method: Method, config: dict[str, Any]) -> bool:
     """:return: whether a policy learns from anything that is another one for another task: examples, files, or episodes"""
-    texts = [grid.dataset, config.get("episodes"), grid.examples if _takes_examples(method) else None]
-    return any("{task}" in str(text) for text in texts)
+    return any("{task}" in str(text) for text in (*_data(grid, method), config.get("episodes")))
+
+
+def _data(grid: Grid, method: Method) -> tuple[Any, Any]:
+    """:return: where a method's dataset and examples are: the grid's, unless its changes say otherwise"""
+    dataset, examples = (method.changes.get(name, getattr(grid, name)) for name in ("dataset", "examples"))
+    return dataset, examples if _takes_examples(method) else None
 
 
 def _filled(paths: Any, task: str) -> Any:

@@ -8,11 +8,11 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from sb3_offline.benchmark.grid import Run
-from sb3_offline.benchmark.worker import train_run
+from sb3_offline.benchmark.worker import record_failure, train_run
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data_tools.workers import prepare_worker
 
-#: A run whose process is killed so many times is left for later: it may need more memory than there is.
+#: A run whose process is killed so many times has failed: it may need more memory than there is.
 MOST_KILLS = 3
 _IN_USE = 75  # the exit code of a process that found another one at its run
 
@@ -21,8 +21,8 @@ def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
     """
     :param runs: that are not finished, in the order in which to start them
     :param n_workers: processes
-    :return: each run when it is finished or has failed. A killed process is no failure of its run: another goes on with it.
-        Raises ``RuntimeError`` at the end where runs are left unfinished
+    :return: each run when it is finished or has failed. Where a process is killed, another goes on with its run, but not for
+        ever. Raises ``RuntimeError`` at the end where runs are left to other processes
     """
     context = multiprocessing.get_context("spawn")
     waiting, left = deque(runs), []
@@ -42,16 +42,18 @@ def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
                     yield run
                     continue
                 kills[run.label] += 1
-                if process.exitcode != _IN_USE and kills[run.label] < MOST_KILLS:
+                if process.exitcode == _IN_USE:
+                    left.append(run.label)
+                elif kills[run.label] < MOST_KILLS:
                     waiting.appendleft(run)
                 else:
-                    reason = "another process is at it" if process.exitcode == _IN_USE else "its process was killed"
-                    left.append(f"{run.label} ({reason})")
+                    record_failure(run, f"its process died {MOST_KILLS} times, with exit code {process.exitcode}")
+                    yield run
     finally:
         for process, _ in working.values():
             process.terminate()
     if left:
-        raise RuntimeError(f"Left unfinished: {'; '.join(left)}. Start the same command again to go on with them")
+        raise RuntimeError(f"Other processes are at these runs: {'; '.join(left)}. Start the same command again afterwards")
 
 
 def _work(run: Run) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import ray
 
 from sb3_offline.benchmark.grid import Run
-from sb3_offline.benchmark.worker import train_run
+from sb3_offline.benchmark.worker import record_failure, train_run
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data_tools.workers import prepare_worker
 
@@ -45,7 +45,10 @@ def train_on_ray(runs: Iterable[Run], address: str) -> Iterator[Run]:
         while tasks:
             for done in ray.wait(list(tasks))[0]:
                 run = tasks.pop(done)
-                ray.get(done)
+                try:
+                    ray.get(done)
+                except ray.exceptions.RayError as error:  # after all retries; the other runs go on
+                    record_failure(run, f"{type(error).__name__}: {error}")
                 yield run
     finally:
         if started_here:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_offline.benchmark.grid import Run
+from sb3_offline.benchmark.grid import Grid, Run
 from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
 from sb3_offline.data.files import replacing
 from sb3_offline.experiment.training import recorded_run
@@ -37,6 +37,23 @@ def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]
             row |= json.loads(provenance.read_text()) if provenance.is_file() else {"commit": "", "versions": ""}
             rows.append(row)
     return rows
+
+
+def rows_outside(path: Path, part: Grid, whole: Grid) -> list[dict[str, Any]]:
+    """
+    :param path: of the CSV file of an earlier call, if there was one
+    :param part: of a grid
+    :param whole: the grid
+    :return: rows in the file of the grid's cells that the part leaves out
+    """
+    if not path.is_file():
+        return []
+    outside = {*whole.cells()} - {*part.cells()}
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        if reader.fieldnames is None or [*reader.fieldnames] != [*FIELDS]:
+            raise RuntimeError(f"{path}: is no table of sb3-offline benchmark, which would replace it; name another --output")
+        return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in outside]
 
 
 def failure_of(run: Run) -> str | None:

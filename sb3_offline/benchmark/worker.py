@@ -40,12 +40,21 @@ def train_run(run: Run) -> None:
             callbacks = [_Provenance(run.folder / PROVENANCE_FILE), *run.tables()]
             train(**run.arguments, callbacks=callbacks, save_freq=run.grid.save_freq, progress_bar=False)
         except Exception as error:
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            failure = {"error": text, "run": run.record(), "traceback": traceback.format_exc()}
-            with replacing(run.folder / FAILURE_FILE) as temporary:
-                temporary.write_text(json.dumps(failure, indent=1))
+            record_failure(run, f"{type(error).__name__}: {error}", traceback.format_exc())
         else:
             (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+
+
+def record_failure(run: Run, error: str, details: str = "") -> None:
+    """
+    :param run: that failed
+    :param error: what the table is to say
+    :param details: what else might help
+    """
+    run.folder.mkdir(parents=True, exist_ok=True)
+    failure = {"error": " ".join(error.split()), "run": run.record(), "traceback": details}
+    with replacing(run.folder / FAILURE_FILE) as temporary:
+        temporary.write_text(json.dumps(failure, indent=1))
 
 
 class _Provenance(BaseCallback):

@@ -231,8 +231,8 @@ def train(
             model = None  # other evaluations were asked for than that run made
     if model is None:
         model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
-        for stale in ("model.zip", RESUME_FILE):  # of an earlier run: this one is finished when its own model is there
-            (output / stale).unlink(missing_ok=True)
+        for stale in (output / "model.zip", resume_file, *output.glob("evaluations*.csv")):
+            stale.unlink(missing_ok=True)  # of an earlier run: this one is finished when its own model and tables are there
         with replacing(output / "config.yml") as temporary:
             temporary.write_text(yaml.safe_dump(record, sort_keys=False))
     if isinstance(model, CEBORL):

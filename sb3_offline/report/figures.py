@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 
 from sb3_offline.report.episodes import PlayedEpisode
-from sb3_offline.report.results import Results, paper_rates
+from sb3_offline.report.results import Results
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -28,7 +28,7 @@ def plot_table(results: Results, path: Path) -> None:
     :param results: ours
     :param path: of the PNG
     """
-    paper, groups, width = paper_rates(), [*results.tasks, "all"], 0.8 / len(results.methods)
+    paper, groups, width = results.paper, [*results.tasks, "all"], 0.8 / len(results.methods)
     figure, axes = plt.subplots(figsize=(11, 3.8), layout="constrained")
     for number, (method, color) in enumerate(colors(results).items()):
         places = np.arange(len(groups)) + (number - (len(results.methods) - 1) / 2) * width

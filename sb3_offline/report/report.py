@@ -7,7 +7,7 @@ from pathlib import Path
 from sb3_offline.report import figures
 from sb3_offline.report.aggregates import REPETITIONS, improvement_probabilities, interquartile_means
 from sb3_offline.report.episodes import PlayedEpisode, play_finals
-from sb3_offline.report.results import FAILED, Results, comparison_table, paper_rates, read_results
+from sb3_offline.report.results import FAILED, Results, comparison_table, read_results
 
 
 def write_report(
@@ -27,6 +27,8 @@ def write_report(
     output.mkdir(parents=True, exist_ok=True)
     for table, folder in zip_longest(tables, runs):
         results = read_results(table)
+        if reference not in results.methods:
+            raise RuntimeError(f"{table}: has no method {reference!r} to compare with, but {', '.join(results.methods)}")
         yield f"{table}: {len(results.cells)} cells"
         parts += _section(results, output, reference)
         if folder is not None:
@@ -57,7 +59,7 @@ def _section(results: Results, output: Path, reference: str) -> list[str]:
 
 
 def _ranking(results: Results) -> str:
-    paper = paper_rates()
+    paper = results.paper
     order = "; ".join(
         f"{method} {mean:.2f}" + (f" (paper {paper[method, 'all']:.2f})" if (method, "all") in paper else "")
         for method, mean in results.means.items()

@@ -32,6 +32,12 @@ class Cell:
         return sum(int(row["successes"]) for row in self.rows)
 
     @property
+    def counts(self) -> str:
+        """Seeds and, on average, episodes of each: "3 x 50"."""
+        n_seeds = len(self.by("seed"))
+        return f"{n_seeds} x {self.episodes // n_seeds}"
+
+    @property
     def rate(self) -> float:
         return self.successes / self.episodes
 
@@ -89,6 +95,14 @@ class Results:
         means = {method: sum(self.cells[method, task].rate for task in self.tasks) / len(self.tasks) for method in whole}
         return dict(sorted(means.items(), key=lambda item: -item[1]))
 
+    @cached_property
+    def paper(self) -> dict[tuple[str, str], float]:
+        """The paper's rates by method and task, and of "all" where these are the tasks here."""
+        rates = paper_rates()
+        if {task for _, task in rates} - {"all"} == {*self.tasks}:
+            return rates
+        return {(method, task): rate for (method, task), rate in rates.items() if task in self.tasks}
+
     def seeds(self, method: str) -> list[int]:
         """:return: of a method, the seeds that have been run on all tasks"""
         of_tasks = [set(self.cells[method, task].by("seed")) if (method, task) in self.cells else set() for task in self.tasks]
@@ -124,17 +138,17 @@ def comparison_table(results: Results) -> str:
     :param results: ours
     :return: Markdown: of each method our success rates with their 95 % intervals, and the paper's below them
     """
-    paper = paper_rates()
-    lines = [f"| method | episodes a task | {' | '.join(results.tasks)} | mean |", "|---" * (len(results.tasks) + 3) + "|"]
+    paper = results.paper
+    lines = [f"| method | seeds x episodes | {' | '.join(results.tasks)} | mean |", "|---" * (len(results.tasks) + 3) + "|"]
     for method in results.methods:
         own = [results.cells.get((method, task)) for task in results.tasks]
-        episodes = sorted({cell.episodes for cell in own if cell})
+        counts = sorted({cell.counts for cell in own if cell})
         mean = f"**{results.means[method]:.2f}**" if method in results.means else ""
-        line = [method, " or ".join(map(str, episodes)), *(cell_text(cell) if cell else "" for cell in own), mean]
+        line = [method, " or ".join(counts), *(cell_text(cell) if cell else "" for cell in own), mean]
         lines.append(f"| {' | '.join(line)} |")
-        if (method, "all") in paper:
+        if any(name == method for name, _ in paper):
             theirs = [f"{paper[method, task]:.2f}" if (method, task) in paper else "" for task in [*results.tasks, "all"]]
-            lines.append(f"| {method}, paper | 150 | {' | '.join(theirs)} |")
+            lines.append(f"| {method}, paper | 3 x 50 | {' | '.join(theirs)} |")
     return "\n".join(lines)
 
 

@@ -1,6 +1,7 @@
 """What Optuna searches, for each algorithm: the spaces that ``python -m sb3_offline.zoo.train -optimize`` draws from."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import optuna
@@ -70,7 +71,12 @@ SPACES: dict[str, dict[str, Suggestion]] = {
 
 
 def sample_params(
-    space: dict[str, Suggestion], trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+    space: dict[str, Suggestion],
+    trial: optuna.Trial,
+    n_actions: int,
+    n_envs: int,
+    additional_args: dict[str, Any],
+    policy_kwargs: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """
     A sampler as ``rl_zoo3`` calls it, once its space is bound.
@@ -80,9 +86,11 @@ def sample_params(
     :param n_actions: not used
     :param n_envs: not used
     :param additional_args: not used
+    :param policy_kwargs: of the config, to which those that are drawn are added
     :return: arguments of the algorithm's constructor
     """
     hyperparams = convert_params({name: suggest(trial, name) for name, suggest in space.items()})
+    hyperparams["policy_kwargs"] = {**policy_kwargs, **hyperparams["policy_kwargs"]}
     for name in {"gamma", "batch_size"} & hyperparams.keys():
         trial.set_user_attr(name, hyperparams[name])  # the value itself beside what was drawn, as rl_zoo3 does it
     return hyperparams

@@ -1,9 +1,11 @@
 """The one place where a run of rl_zoo3 differs for offline algorithms: what its config means."""
 
 import argparse
+from functools import partial
 from typing import Any
 
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_offline
@@ -12,6 +14,7 @@ from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.config import config_path
 from sb3_offline.experiment.data import resolve_data
+from sb3_offline.zoo.hyperparams import SPACES, sample_params
 
 
 class OfflineExperimentManager(ExperimentManager):
@@ -21,6 +24,7 @@ class OfflineExperimentManager(ExperimentManager):
     - The config of an offline algorithm is by default the shipped one; ``config`` may be the name of another shipped one.
     - ``dataset``, ``examples`` and ``episodes`` of a config mean what they mean to ``sb3-offline train``, and what is wrong
       with them is said before a run begins.
+    - The network that a trial of Optuna draws is added to the config's ``policy_kwargs``, in place of replacing them all.
     - The ``env_kwargs`` that were given are added to the config's, in place of replacing them all, and the environment of the
       evaluations has them too.
 
@@ -31,6 +35,7 @@ class OfflineExperimentManager(ExperimentManager):
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, *rest: Any, **kwargs: Any):
+        self._drawn_policy_kwargs: dict[str, Any] = {}
         super().__init__(args, algo, *rest, **kwargs)
         config = config_path(kwargs.get("config") or algo)
         if algo in sb3_offline.ALGOS and config.is_file():
@@ -44,6 +49,12 @@ class OfflineExperimentManager(ExperimentManager):
         self.eval_env_kwargs = {**env_kwargs, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
 
+    def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        drawn = super().load_trial(*args, **kwargs)
+        if self.algo in sb3_offline.ALGOS:
+            self._drawn_policy_kwargs = drawn.pop("policy_kwargs", {})
+        return drawn
+
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
         if self.algo in sb3_offline.ALGOS:
             hyperparams = resolve_data(hyperparams, hyperparams["env_kwargs"])
@@ -53,7 +64,12 @@ class OfflineExperimentManager(ExperimentManager):
             datasets = open_datasets(hyperparams["dataset"])
             if hyperparams.get("examples") is not None:
                 load_examples(hyperparams["examples"], datasets[0].observation_space)
-        return super()._preprocess_hyperparams(hyperparams)
+        hyperparams, *rest = super()._preprocess_hyperparams(hyperparams)
+        if self.algo in sb3_offline.ALGOS:
+            policy_kwargs = {**hyperparams.get("policy_kwargs", {}), **self._drawn_policy_kwargs}
+            hyperparams["policy_kwargs"] = policy_kwargs
+            HYPERPARAMS_SAMPLER[self.algo] = partial(sample_params, SPACES[self.algo], policy_kwargs=policy_kwargs)
+        return hyperparams, *rest
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         try:
