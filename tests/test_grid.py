@@ -141,7 +141,7 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path):
     assert cells["bc", "door-open", 3] is cells["bc", "drawer-open", 3]
     assert cells["cql", "door-open", 3] is not cells["cql", "drawer-open", 3]
     tables = cells["bc", "door-open", 3].tables()
-    assert [list(table.seeds) for table in tables] == [[104_000, 104_001]] * 2
+    assert [list(table.seeds) for table in tables] == [[104_002, 104_003, 104_000, 104_001]] * 2
     assert [table.env_kwargs["task"] for table in tables] == GRID["tasks"]
 
     run_benchmark(tmp_path, grid, "--methods", "bc", "--no-training", "--policies", str(tmp_path / "policies"))
@@ -185,6 +185,7 @@ def test_a_method_may_have_data_of_its_own(data, tmp_path):
 def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
     pytest.importorskip("rliable")
     from sb3_offline.report import aggregates
+    from sb3_offline.report.results import read_results, with_early_checkpoints
 
     monkeypatch.setattr(aggregates, "REPETITIONS", 10)
     options = ["--methods", "ceborl", "bc", "--tasks", "door-open"]
@@ -194,6 +195,9 @@ def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
     for name in ("table_door-open.jpg", "table_values.png"):
         with Image.open(tmp_path / "report" / name) as picture:
             assert picture.width > 200 and name in text
+    results = read_results(tmp_path / "table.csv")
+    assert [*results.cells["bc", "door-open"].by("step")] == [3, 4]
+    assert [*with_early_checkpoints(results, tmp_path / "runs").cells["bc", "door-open"].by("step")] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(

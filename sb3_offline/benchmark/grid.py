@@ -131,15 +131,15 @@ class Run:
         :return: the callback that evaluates the run's policy on it
         """
         grid, config = self.grid, self.arguments["config"]
-        steps = grid.evaluation_steps()
+        n_early, seed = grid.checkpoints, self.arguments["seed"]  # those of the first half are for the learning curve
         return EvaluationTable(
             self.folder / f"evaluations-{task}.csv",
             grid.env,
             {**config.get("env_kwargs", {}), "task": task},
             eval_freq=grid.n_timesteps // (2 * grid.checkpoints),
             n_episodes=grid.episodes,
-            eval_start=steps[0],
-            seeds=[evaluation_seed(self.arguments["seed"], index) for index in range(grid.checkpoints)],
+            count_from=grid.evaluation_steps()[0],
+            seeds=[evaluation_seed(seed, (n_early + index) % (2 * n_early)) for index in range(2 * n_early)],
         )
 
     def record(self) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class EvaluationTable(BaseCallback):
     :param env_kwargs: of the environment
     :param eval_freq: gradient steps between evaluations
     :param n_episodes: episodes of each
-    :param eval_start: no evaluation at an earlier step
+    :param count_from: evaluations at earlier steps may be missing where the table is complete
     :param seeds: of the evaluations, one after the other (default: all play the same episodes)
     :param verbose: 1 prints each success rate
     """
@@ -44,13 +44,13 @@ class EvaluationTable(BaseCallback):
         env_kwargs: dict[str, Any],
         eval_freq: int,
         n_episodes: int,
-        eval_start: int = 0,
+        count_from: int = 0,
         seeds: Sequence[int] | None = None,
         verbose: int = 0,
     ):
         super().__init__(verbose)
         self.path, self.env_id, self.env_kwargs = path, env_id, env_kwargs
-        self.eval_freq, self.n_episodes, self.eval_start, self.seeds = eval_freq, n_episodes, eval_start, seeds
+        self.eval_freq, self.n_episodes, self.count_from, self.seeds = eval_freq, n_episodes, count_from, seeds
 
     def rows(self, until: int) -> list[dict[str, str]]:
         """
@@ -65,25 +65,26 @@ class EvaluationTable(BaseCallback):
     def steps(self, until: int) -> list[int]:
         """
         :param until: last step to look at
-        :return: steps up to there at which there are evaluations
+        :return: steps up to there at which there have to be evaluations
         """
-        return [step for step in range(self.eval_freq, until + 1, self.eval_freq) if step >= self.eval_start]
+        return [step for step in range(self.eval_freq, until + 1, self.eval_freq) if step >= self.count_from]
 
     def is_complete(self, until: int) -> bool:
         """
         :param until: last step to look at
-        :return: whether the file holds all evaluations up to there
+        :return: whether the file holds all evaluations that count up to there
         """
         found = [(int(row["step"]), int(row["episodes"])) for row in self.rows(until)]
-        return found == [(step, self.n_episodes) for step in self.steps(until)]
+        wanted = [(step, self.n_episodes) for step in self.steps(until)]
+        return [row for row in found if row[0] >= self.count_from] == wanted
 
     def _on_training_start(self) -> None:
         self._write(self.rows(self.num_timesteps))
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.eval_freq == 0 and self.num_timesteps >= self.eval_start:
+        if self.num_timesteps % self.eval_freq == 0:
             rows = self.rows(self.num_timesteps - 1)
-            seed = EVALUATION_SEED if self.seeds is None else self.seeds[len(rows)]
+            seed = EVALUATION_SEED if self.seeds is None else self.seeds[self.num_timesteps // self.eval_freq - 1]
             result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes, seed)
             values = map(str, evaluation_row(self.num_timesteps, result))
             self._write([*rows, dict(zip(EVALUATION_FIELDS, values, strict=True))])

@@ -53,7 +53,7 @@ def plot_table(results: Results, path: Path) -> None:
 
 def plot_curves(results: Results, path: Path) -> None:
     """
-    A panel a task, a line a method: the success rate at each checkpoint that counts, in front of its 95 % interval.
+    A panel a task, a line a method: the success rate at each checkpoint, in front of its 95 % interval.
 
     :param results: ours
     :param path: of the PNG

@@ -7,7 +7,7 @@ from pathlib import Path
 from sb3_offline.report import figures
 from sb3_offline.report.aggregates import REPETITIONS, improvement_probabilities, interquartile_means
 from sb3_offline.report.episodes import PlayedEpisode, play_finals
-from sb3_offline.report.results import FAILED, Results, comparison_table, read_results
+from sb3_offline.report.results import FAILED, Results, comparison_table, read_results, with_early_checkpoints
 
 
 def write_report(
@@ -31,6 +31,9 @@ def write_report(
             raise RuntimeError(f"{table}: has no method {reference!r} to compare with, but {', '.join(results.methods)}")
         yield f"{table}: {len(results.cells)} cells"
         parts += _section(results, output, reference)
+        figures.plot_curves(
+            with_early_checkpoints(results, folder) if folder else results, output / f"{results.name}_curves.png"
+        )
         if folder is not None:
             yield f"Playing the final policies in {folder}"
             parts += _episodes(results, folder, output)
@@ -40,7 +43,6 @@ def write_report(
 
 def _section(results: Results, output: Path, reference: str) -> list[str]:
     figures.plot_table(results, output / f"{results.name}.png")
-    figures.plot_curves(results, output / f"{results.name}_curves.png")
     steps = sorted({int(row["step"]) for row in results.rows})
     return [
         f"## {results.name}",
@@ -53,7 +55,7 @@ def _section(results: Results, output: Path, reference: str) -> list[str]:
         f"![Success rates by task, beside the paper's]({results.name}.png)",
         "### Over all tasks",
         _aggregates(results, reference),
-        "### Over the checkpoints",
+        "### Learning curves",
         f"![Success rate at each checkpoint]({results.name}_curves.png)",
     ]
 

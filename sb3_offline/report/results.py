@@ -6,6 +6,7 @@ from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
+from sb3_offline.benchmark.grid import cell_folder
 from sb3_offline.experiment.evaluation import success_interval
 
 COUNTS = ("episodes", "successes")
@@ -125,6 +126,23 @@ def read_results(path: Path) -> Results:
             f"{', '.join(COLUMNS)}"
         )
     return Results(path.stem, rows)
+
+
+def with_early_checkpoints(results: Results, runs: Path) -> Results:
+    """
+    :param results: ours
+    :param runs: folder of the runs
+    :return: with a row for each evaluation in there of a step before those that count
+    """
+    first, early = min(int(row["step"]) for row in results.rows), []
+    for (method, task), cell in results.cells.items():
+        for seed in cell.by("seed"):
+            file = cell_folder(runs, method, task, seed) / f"evaluations-{task}.csv"
+            if file.is_file():
+                with file.open(newline="") as lines:
+                    named = {"method": method, "task": task, "seed": str(seed), "config": ""}
+                    early += [{**row, **named} for row in csv.DictReader(lines) if int(row["step"]) < first]
+    return Results(results.name, [*results.rows, *early])
 
 
 def paper_rates() -> dict[tuple[str, str], float]:
