@@ -101,6 +101,8 @@ class CEBORL(ExampleBasedAlgorithm):
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
+    :param policy_random_shift: the same for the images that the policy imitates alone, where it has an encoder of its own
+        (default: ``random_shift``)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -143,6 +145,7 @@ class CEBORL(ExampleBasedAlgorithm):
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int = 0,
+        policy_random_shift: int | None = None,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -189,6 +192,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.advantage_floor = advantage_floor
         self.weight_max = weight_max
         self.state_exponent = state_exponent
+        self.policy_random_shift = policy_random_shift
         self._weighted_transitions = WeightedTransitions(policy_batches)
         self._n_dataset_steps = 0
         self.ent_coef = ent_coef
@@ -291,7 +295,7 @@ class CEBORL(ExampleBasedAlgorithm):
         """:return: features and actions of the last batches' transitions, drawn by their weights"""
         steps = self._weighted_transitions.draw(batch_size)
         observations, actions = self.replay_buffer.pairs(steps, env=self._vec_normalize_env)
-        return self.actor.encode(self.augment(observations)), actions
+        return self.actor.encode(self.augment(observations, self.policy_random_shift)), actions
 
     def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
         """

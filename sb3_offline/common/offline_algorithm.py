@@ -193,12 +193,14 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         if self._replay_buffer is not None:
             self._fit_observation_statistics()
 
-    def augment(self, observations: PyTorchObs) -> PyTorchObs:
+    def augment(self, observations: PyTorchObs, max_shift: int | None = None) -> PyTorchObs:
         """
         :param observations: a batch as the buffer gives it
-        :return: the batch with its images shifted by up to ``random_shift`` pixels
+        :param max_shift: largest shift in pixels (default: ``random_shift``)
+        :return: the batch with its images shifted
         """
-        return shift_observations(observations, self.observation_space, self.random_shift, self.replay_buffer.rng)
+        max_shift = self.random_shift if max_shift is None else max_shift
+        return shift_observations(observations, self.observation_space, max_shift, self.replay_buffer.rng)
 
     # -------------------------------------------------------------- learning
 
