@@ -1,6 +1,7 @@
 """One step of ``train()`` against a plain NumPy float64 reading of Eq. 10 and 11: what goes into the terms, not they alone."""
 
 import copy
+from functools import partial
 
 import numpy as np
 import pytest
@@ -297,11 +298,30 @@ def test_every_batch_of_images_is_shifted(dataset, monkeypatch):
     kwargs = {"batch_size": 8, "example_batch_size": 4, "random_shift": 4, "policy_kwargs": kwargs}
     model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, **kwargs)
     sizes, augment = [], model.augment
-    monkeypatch.setattr(model, "augment", lambda batch: sizes.append(len(batch)) or augment(batch))
+    monkeypatch.setattr(model, "augment", lambda batch, *shift: sizes.append(len(batch)) or augment(batch, *shift))
     model.learn(1)
     assert sorted(sizes)[1:] == [8] * 4 and min(sizes) <= 4  # the examples drawn; s, s', the n-step state, the policy's batch
     batch = model.replay_buffer.sample(8).observations
     assert not th.equal(augment(batch), batch)
+
+
+def test_the_policys_images_may_be_shifted_alone(dataset, monkeypatch):
+    examples = make_observations(IMAGES, 4, np.random.default_rng(0))
+    kwargs = {"batch_size": 8, "example_batch_size": 4, "policy_kwargs": {**SMALL, "share_features_extractor": False}}
+    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, policy_random_shift=4, **kwargs)
+    encoded = {}
+    for name, module in (("policy", model.actor), ("critic", model.critic), ("target", model.critic_target)):
+        monkeypatch.setattr(module, "encode", partial(_encoded, encoded.setdefault(name, []), module.encode))
+    model.learn(1)
+    stored = {image.numpy().tobytes() for image in model.replay_buffer.pairs(np.arange(model.replay_buffer.size()))[0]}
+    stored |= {image.tobytes() for image in model.all_examples().numpy()}
+    known = {name: [image.numpy().tobytes() in stored for image in th.cat(batches)] for name, batches in encoded.items()}
+    assert all(known["critic"]) and not all(known["policy"])
+
+
+def _encoded(batches, encode, observations):
+    batches.append(observations)
+    return encode(observations)
 
 
 @pytest.mark.parametrize("max_shift", [0, 3])

@@ -101,8 +101,8 @@ class CEBORL(ExampleBasedAlgorithm):
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
-    :param policy_random_shift: the same for the images that the policy imitates alone, where it has an encoder of its own
-        (default: ``random_shift``)
+    :param policy_random_shift: the same for the images that the policy imitates, and for those alone (default:
+        ``random_shift``)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
