@@ -76,6 +76,11 @@ def test_one_command_makes_the_report(table, tmp_path, monkeypatch):
             assert picture.width > 500
 
 
+def test_an_unknown_reference_is_refused(table, tmp_path):
+    with pytest.raises(SystemExit, match="no method 'cebrol'"):
+        cli.main(["report", str(table), "-o", str(tmp_path / "report"), "--reference", "cebrol"])
+
+
 @pytest.mark.parametrize(("content", "message"), [(None, "no such file"), ("method,task\nx,y\n", "seed, step, ")])
 def test_what_is_no_table_is_refused(tmp_path, content, message):
     if content:

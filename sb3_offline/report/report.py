@@ -23,12 +23,12 @@ def write_report(
     """
     if runs and len(runs) != len(tables):
         raise RuntimeError(f"There are {len(tables)} tables and {len(runs)} folders of runs; give one each, or no folder")
+    if not any(reference in read_results(table).methods for table in tables):
+        raise RuntimeError(f"{', '.join(map(str, tables))}: there is no method {reference!r} to compare with (--reference)")
     parts = ["# Report", *([notes.read_text().strip()] if notes else [])]
     output.mkdir(parents=True, exist_ok=True)
     for table, folder in zip_longest(tables, runs):
         results = read_results(table)
-        if reference not in results.methods:
-            raise RuntimeError(f"{table}: has no method {reference!r} to compare with, but {', '.join(results.methods)}")
         yield f"{table}: {len(results.cells)} cells"
         parts += _section(results, output, reference)
         figures.plot_curves(
@@ -81,9 +81,11 @@ def _failures(results: Results) -> list[str]:
 
 def _aggregates(results: Results, reference: str) -> str:
     means, better = interquartile_means(results), improvement_probabilities(results, reference)
-    lines = [f"| method | seeds | interquartile mean | P({reference} does better) |", "|---" * 4 + "|"]
+    lines = ["| method | seeds | interquartile mean |" + f" P({reference} does better) |" * bool(better)]
+    lines.append("|---" * (4 if better else 3) + "|")
     for method, mean in means.items():
-        lines.append(f"| {method} | {len(results.seeds(method))} | {mean} | {better.get(method, '')} |")
+        line = f"| {method} | {len(results.seeds(method))} | {mean} |"
+        lines.append(line + f" {better.get(method, '')} |" * bool(better))
     about = (
         "The interquartile mean is that of the middle half of all runs, over tasks and seeds. The probability is that of a "
         f"run of {reference} beating one of the other method on the same task, ties counting half, averaged over the tasks. "
