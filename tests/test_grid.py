@@ -132,9 +132,10 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["bc"] * 2 + ["wrong"] * 2
 
 
-def test_what_no_task_decides_is_trained_once(data, tmp_path):
+def test_what_no_task_decides_is_trained_once(data, tmp_path, capsys):
     grid = write_grid(tmp_path, data)
     rows = run_benchmark(tmp_path, grid, "--methods", "bc")
+    assert "of 4 episodes solved" in capsys.readouterr().out  # two tasks, two checkpoints that count
     assert [(row["task"], row["step"]) for row in rows] == [(task, step) for task in GRID["tasks"] for step in ("30", "40")]
     assert [path.name for path in (tmp_path / "runs/bc").iterdir()] == ["seed3"]
     cells = plan(load_grid(grid), tmp_path / "runs")

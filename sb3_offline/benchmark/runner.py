@@ -75,6 +75,7 @@ def _outcome(run: Run) -> str:
     failure = failure_of(run)
     if failure:
         return f"failed: {failure}"
-    rows = [row for table in run.tables() for row in table.rows(run.grid.n_timesteps)]
+    counted = {*run.grid.evaluation_steps()}
+    rows = [row for table in run.tables() for row in table.rows(run.grid.n_timesteps) if int(row["step"]) in counted]
     solved, episodes = (sum(int(row[name]) for row in rows) for name in ("successes", "episodes"))
     return f"{solved} of {episodes} episodes solved"
