@@ -75,7 +75,6 @@ def _outcome(run: Run) -> str:
     failure = failure_of(run)
     if failure:
         return f"failed: {failure}"
-    counted = {*run.grid.evaluation_steps()}
-    rows = [row for table in run.tables() for row in table.rows(run.grid.n_timesteps) if int(row["step"]) in counted]
+    rows = [row for table in run.tables() for row in table.counted_rows(run.grid.n_timesteps)]
     solved, episodes = (sum(int(row[name]) for row in rows) for name in ("successes", "episodes"))
     return f"{solved} of {episodes} episodes solved"

@@ -69,14 +69,20 @@ class EvaluationTable(BaseCallback):
         """
         return [step for step in range(self.eval_freq, until + 1, self.eval_freq) if step >= self.count_from]
 
+    def counted_rows(self, until: int) -> list[dict[str, str]]:
+        """
+        :param until: last step to look at
+        :return: those of :meth:`rows` that count
+        """
+        return [row for row in self.rows(until) if int(row["step"]) >= self.count_from]
+
     def is_complete(self, until: int) -> bool:
         """
         :param until: last step to look at
         :return: whether the file holds all evaluations that count up to there
         """
-        found = [(int(row["step"]), int(row["episodes"])) for row in self.rows(until)]
-        wanted = [(step, self.n_episodes) for step in self.steps(until)]
-        return [row for row in found if row[0] >= self.count_from] == wanted
+        found = [(int(row["step"]), int(row["episodes"])) for row in self.counted_rows(until)]
+        return found == [(step, self.n_episodes) for step in self.steps(until)]
 
     def _on_training_start(self) -> None:
         self._write(self.rows(self.num_timesteps))

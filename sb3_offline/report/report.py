@@ -23,12 +23,12 @@ def write_report(
     """
     if runs and len(runs) != len(tables):
         raise RuntimeError(f"There are {len(tables)} tables and {len(runs)} folders of runs; give one each, or no folder")
-    if not any(reference in read_results(table).methods for table in tables):
+    contents = [read_results(table) for table in tables]
+    if not any(reference in results.methods for results in contents):
         raise RuntimeError(f"{', '.join(map(str, tables))}: there is no method {reference!r} to compare with (--reference)")
     parts = ["# Report", *([notes.read_text().strip()] if notes else [])]
     output.mkdir(parents=True, exist_ok=True)
-    for table, folder in zip_longest(tables, runs):
-        results = read_results(table)
+    for table, results, folder in zip_longest(tables, contents, runs):
         yield f"{table}: {len(results.cells)} cells"
         parts += _section(results, output, reference)
         figures.plot_curves(
