@@ -226,10 +226,10 @@ class CEBORL(ExampleBasedAlgorithm):
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             observations = self.augment(batch.observations)
-            features = self.critic.encode(observations)
             examples, example_rows = self.sample_examples()
             examples = self.augment(examples)
-            example_features = self.critic.encode(examples)[example_rows]
+            features, distinct_features = self.critic.encode(_joined([observations, examples])).tensor_split([batch_size])
+            example_features = distinct_features[example_rows]
             with th.no_grad():
                 example_policy_features = self._policy_features(examples, example_features, example_rows)
                 example_actions, _ = self.actor.sample(example_policy_features)
@@ -335,13 +335,14 @@ class CEBORL(ExampleBasedAlgorithm):
             assert batch.nstep_observations is not None
             successors, dataset_actions = [*successors, batch.nstep_observations], [*dataset_actions, batch.nstep_actions]
         successors = [self.augment(observations) for observations in successors]
-        features = th.cat([self.critic_target.encode(observations) for observations in successors])
+        successors_together = _joined(successors)
+        features = self.critic_target.encode(successors_together)
         if self.backup == "expectile":
             logits = self.critic_target.state_values(features).unsqueeze(0)
         elif self.backup == "dataset":
             logits = self.critic_target.values(features, th.cat(dataset_actions))  # type: ignore[arg-type]
         else:
-            actions, _ = self.actor.sample(th.cat([self.actor.encode(observations) for observations in successors]))
+            actions, _ = self.actor.sample(self.actor.encode(successors_together))
             logits = self.critic_target.values(features, actions)
         self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
         return logits.chunk(len(successors), dim=1)
@@ -371,3 +372,10 @@ class CEBORL(ExampleBasedAlgorithm):
             omega_p50=p50,
             omega_p99=p99,
         )
+
+
+def _joined(batches: list[PyTorchObs]) -> PyTorchObs:
+    """:return: one batch of all, for one pass of an encoder: its weights take longer than the images of a small batch"""
+    if isinstance(batches[0], dict):
+        return {key: th.cat([batch[key] for batch in batches]) for key in batches[0]}  # type: ignore[index]
+    return th.cat(batches)  # type: ignore[arg-type]

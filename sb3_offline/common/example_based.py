@@ -83,7 +83,9 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         if self._vec_normalize_env is not None:
             self.replay_buffer  # noqa: B018  (the statistics are fitted when the dataset is opened)
             examples = self._vec_normalize_env.normalize_obs(examples)
-        return examples if isinstance(examples, dict) else {"": examples}
+        arrays = examples if isinstance(examples, dict) else {"": examples}
+        # Numbers of a discrete space become columns, as the buffer gives them.
+        return {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [*super()._excluded_save_params(), "_example_arrays", "_example_source"]
