@@ -6,7 +6,7 @@ from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
-from sb3_offline.benchmark.grid import cell_folder
+from sb3_offline.benchmark.grid import cell_folder, evaluations_file
 from sb3_offline.experiment.evaluation import success_interval
 
 COUNTS = ("episodes", "successes")
@@ -137,7 +137,7 @@ def with_early_checkpoints(results: Results, runs: Path) -> Results:
     first, early = min(int(row["step"]) for row in results.rows), []
     for (method, task), cell in results.cells.items():
         for seed in cell.by("seed"):
-            file = cell_folder(runs, method, task, seed) / f"evaluations-{task}.csv"
+            file = evaluations_file(cell_folder(runs, method, task, seed), task)
             if file.is_file():
                 with file.open(newline="") as lines:
                     named = {"method": method, "task": task, "seed": str(seed), "config": ""}
