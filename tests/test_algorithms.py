@@ -219,14 +219,25 @@ def test_the_users_policy_kwargs_stay_as_they_are(files):
     assert rce.critic.q_networks[0][-1].bias.item() == 0.0  # odds of 1, not CEBORL's
 
 
-@pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.MultiDiscrete([3, 4])])
-def test_one_hot_observations_are_not_standardised(space, tmp_path):
+@pytest.mark.parametrize(
+    "policy, space",
+    [
+        ("MlpPolicy", spaces.Discrete(5)),
+        ("MlpPolicy", spaces.MultiDiscrete([3, 4])),
+        ("MultiInputPolicy", spaces.Dict({"colour": spaces.Discrete(5), "shape": spaces.MultiDiscrete([3, 4])})),
+    ],
+)
+def test_one_hot_observations_are_not_standardised(policy, space, tmp_path):
+    def samples(n):
+        drawn = [space.sample() for _ in range(n)]
+        is_dict = isinstance(space, spaces.Dict)
+        return {key: np.stack([one[key] for one in drawn]) for key in space} if is_dict else np.stack(drawn)
+
     with DatasetWriter(tmp_path / "d.h5", space, ACTIONS, rewards=False, success=False) as writer:
         space.seed(0)
-        writer.add_episode(np.stack([space.sample() for _ in range(9)]), np.stack([ACTIONS.sample() for _ in range(8)]))
-    examples = np.stack([space.sample() for _ in range(4)])
-    model = ALGOS["ceborl"]("MlpPolicy", None, tmp_path / "d.h5", examples, n_action_samples=2).learn(2)
-    assert not model.actor.features_extractor.fitted
+        writer.add_episode(samples(9), np.stack([ACTIONS.sample() for _ in range(8)]))
+    model = ALGOS["ceborl"](policy, None, tmp_path / "d.h5", samples(4), n_action_samples=2).learn(2)
+    assert not model.policy.standardizes
     assert model.predict(space.sample())[0].shape == ACTIONS.shape
 
 
