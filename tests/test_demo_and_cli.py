@@ -72,6 +72,15 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     cli.main(["evaluate", f"{run}/model.zip", "--episodes", "1"])
     assert "of 1 episodes solved" in capsys.readouterr().out
 
+    def files():
+        return {file.name: file.read_bytes() for file in (tmp_path / "run").iterdir()}
+
+    before = files()
+    train[train.index("--examples") + 1] = "typo.h5"
+    with pytest.raises(SystemExit, match="typo.h5"):
+        cli.main([*train, "--eval-freq", "1", "-o", run])
+    assert files() == before  # a run stays until the data of the next one are found good
+
 
 @pytest.mark.parametrize("algo", ALGOS)
 def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):

@@ -164,6 +164,10 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._replay_buffer = buffer
         self._opened_sources = self._data_sources() if buffer is not None else ()
 
+    def _open_data(self) -> None:
+        """Open and check all that is learned from."""
+        self.replay_buffer  # noqa: B018
+
     def _data_sources(self) -> tuple[Any, ...]:
         """What the buffer is made of: it is made anew when one of these is replaced."""
         return (self.dataset,)
@@ -228,6 +232,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._open_data()  # before callbacks replace what an earlier run left
         callback.on_training_start(locals(), globals())
 
         while self.num_timesteps < total_timesteps:

@@ -106,6 +106,26 @@ class EvaluationTable(BaseCallback):
             writer.writerows(rows)
 
 
+class _ReplaceEarlierRun(BaseCallback):
+    """
+    Takes over a folder when the data were found good. Files of an earlier run go first: this one is finished when its own model
+    and tables are there.
+    """
+
+    def __init__(self, output: Path, record: dict[str, Any]):
+        super().__init__()
+        self.output, self.record = output, record
+
+    def _on_training_start(self) -> None:
+        for stale in (self.output / "model.zip", self.output / RESUME_FILE, *self.output.glob("evaluations*.csv")):
+            stale.unlink(missing_ok=True)
+        with replacing(self.output / "config.yml") as temporary:
+            temporary.write_text(yaml.safe_dump(self.record, sort_keys=False))
+
+    def _on_step(self) -> bool:
+        return True
+
+
 class _SaveForResume(BaseCallback):
     """Saves all that a killed run needs to go on. The last callback: what others wrote at this step is on the disk before."""
 
@@ -238,10 +258,7 @@ def train(
             model = None  # other evaluations were asked for than that run made
     if model is None:
         model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
-        for stale in (output / "model.zip", resume_file, *output.glob("evaluations*.csv")):
-            stale.unlink(missing_ok=True)  # of an earlier run: this one is finished when its own model and tables are there
-        with replacing(output / "config.yml") as temporary:
-            temporary.write_text(yaml.safe_dump(record, sort_keys=False))
+        all_callbacks.insert(0, _ReplaceEarlierRun(output, record))
     if isinstance(model, CEBORL):
         all_callbacks.append(DiagnosticsCallback())
     if save_freq:
