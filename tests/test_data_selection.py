@@ -9,6 +9,7 @@ from data_files import ACTIONS, BOTH, STATES, make_episode, write_dataset
 from sb3_offline import BC
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.selection import select_episodes
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.experiment.training import create_model
@@ -59,6 +60,16 @@ def test_what_cannot_be_chosen_is_named(tmp_path):
         create_model("bc", config, str(tmp_path / "d.h5"))
     with pytest.raises(RuntimeError, match="`source` and `success`"):
         create_model("bc", {**config, "episodes": {"rewards": 1}}, str(tmp_path / "d.h5"))
+
+
+def test_masks_choose_episodes(tmp_path):
+    write_dataset(tmp_path / "d.h5", 4)
+    dataset = OfflineDataset(tmp_path / "d.h5")
+    chosen = dataset.select(np.array([False, True, False, True]))
+    assert chosen.seeds.tolist() == [1, 3] and chosen.select([False, True]).seeds.tolist() == [3]
+    for wrong, message in (([True, False], "mask of 2"), ([4], "names episode 4"), ([-1], "names episode -1")):
+        with pytest.raises(DatasetError, match=rf"d\.h5: episodes: .*{message}"):
+            dataset.select(wrong)
 
 
 def test_a_config_chooses_what_is_learned_from(tmp_path):

@@ -241,6 +241,10 @@ def test_an_episode_of_a_file_with_an_empty_list_of_sources_is_refused(tmp_path)
         spaces.Discrete(5, start=-1),
         spaces.MultiDiscrete([2, 3]),
         spaces.MultiBinary((2, 2)),
+        spaces.MultiBinary(3),
+        spaces.MultiDiscrete([2, 3], np.int32, start=[1, -1]),
+        spaces.Box(0, np.iinfo(np.int64).max, (2,), np.int64),
+        spaces.Box(-np.inf, np.inf, (2,), np.int64),
         spaces.Dict({"b": IMAGES, "a": spaces.Discrete(3)}),
     ],
 )
@@ -249,3 +253,17 @@ def test_spaces_survive_json(space):
     assert again == space and again.dtype == space.dtype
     with pytest.raises(DatasetError, match="cannot be stored"):
         space_to_json(spaces.Tuple([space]))
+
+
+def test_extras_may_be_text_and_nan(tmp_path):
+    extras = {"word": ((), "S5"), "number": ((), np.float32)}
+    with DatasetWriter(tmp_path / "d.h5", ACTIONS, ACTIONS, rewards=False, success=False, extras=extras) as writer:
+        steps = np.ones((2, 2), np.float32)
+        number, word = np.array([np.nan, 1.0]), np.array([b"one", b"three"])
+        writer.add_episode(np.ones((3, 2), np.float32), steps, extras={"word": word, "number": number})
+        for wrong, message in ((np.array([b"fourteen"] * 2), "room for 5"), (np.array(["a", "b"]), "np.char.encode")):
+            with pytest.raises(DatasetError, match=f"extras/word: .*{message}"):
+                writer.add_episode(np.ones((3, 2), np.float32), steps, extras={"word": wrong, "number": number})
+    dataset = OfflineDataset(tmp_path / "d.h5")
+    assert dataset.extras["word"][:].tolist() == word.tolist()
+    np.testing.assert_array_equal(dataset.extras["number"], number)

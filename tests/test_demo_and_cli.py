@@ -77,7 +77,7 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
 
     before = files()
     train[train.index("--examples") + 1] = "typo.h5"
-    with pytest.raises(SystemExit, match="typo.h5"):
+    with pytest.raises(SystemExit, match=r"typo\.h5"):
         cli.main([*train, "--eval-freq", "1", "-o", run])
     assert files() == before  # a run stays until the data of the next one are found good
 

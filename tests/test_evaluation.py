@@ -106,6 +106,18 @@ def test_probabilities_are_judged_by_what_they_say():
     assert come.tolist() == [True, True, False, False, True, True]
 
 
+def test_held_out_data_get_the_models_rewards(files):  # noqa: F811
+    dataset = files["MlpPolicy"][0]
+    model = CQL("MlpPolicy", None, dataset, reward_fn="success", policy_kwargs={"net_arch": [8]}).learn(1)
+    found = []
+    for data in (None, dataset):
+        callback = OfflineEvalCallback(data, fqe_steps=1)
+        callback.init_callback(model)
+        callback.on_training_start({}, {})
+        found.append(callback.evaluate())
+    assert found[0] == pytest.approx(found[1]) and "fqe_value" in found[0]
+
+
 def test_data_without_rewards_cannot_be_evaluated_on(tmp_path):
     episode = make_episode(0, POLICIES["MlpPolicy"])
     with DatasetWriter(tmp_path / "d.h5", POLICIES["MlpPolicy"], ACTIONS, rewards=False, success=False) as writer:

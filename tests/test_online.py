@@ -63,6 +63,25 @@ def test_batches_mix_dataset_and_environment_in_the_ratio(space, tmp_path):
     assert {len(array) for array in arrays} == {16} and batch.actions.shape == (16, 2) and batch.dones.shape == (16, 1)
 
 
+def test_sac_goes_on_with_the_rewards_that_the_critic_knows(files, tmp_path):  # noqa: F811
+    model = make("cql", "MlpPolicy", files, reward_fn="success").learn(1)
+    export_sac(model, tmp_path / "sac", data_ratio=0.5, buffer_size=100)
+    sac = SAC.load(tmp_path / "sac", env=ForbiddenEnv(STATES, allowed=True))
+    assert set(np.unique(sac.replay_buffer.offline.rewards)) == {0, 1}
+
+
+def test_mixed_batches_follow_the_seed(files):  # noqa: F811
+    kwargs = {"dataset": files["MlpPolicy"][0]}
+    ends = []
+    for _ in range(2):
+        env = ForbiddenEnv(STATES, allowed=True)
+        env.observation_space.seed(0)
+        sac = SAC("MlpPolicy", env, seed=0, learning_starts=2, batch_size=4, buffer_size=20, policy_kwargs={"net_arch": [4]},
+                  replay_buffer_class=MixedReplayBuffer, replay_buffer_kwargs=kwargs)  # fmt: skip
+        ends.append(th.cat([parameter.flatten() for parameter in sac.learn(5).policy.parameters()]))
+    assert th.equal(*ends)
+
+
 def test_a_dataset_without_rewards_cannot_be_mixed_in(tmp_path):
     from sb3_offline.data.writer import DatasetWriter
 

@@ -1,6 +1,7 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 import math
+import zlib
 from typing import Any, Literal
 
 import torch as th
@@ -194,7 +195,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.state_exponent = state_exponent
         self.policy_random_shift = policy_random_shift
         self._weighted_transitions = WeightedTransitions(policy_batches)
-        self._n_dataset_steps = 0
+        self._dataset_checksum: int | None = None
         self.ent_coef = ent_coef
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
@@ -212,12 +213,16 @@ class CEBORL(ExampleBasedAlgorithm):
             self.policy_kwargs.setdefault("std_min", 0.05)
         super()._setup_model()
 
+    def _open_data(self) -> None:
+        super()._open_data()
+        self._loaded_examples()
+
     def _prepare_data(self) -> None:
         super()._prepare_data()
-        n_steps = self.replay_buffer.size()
-        if n_steps != self._n_dataset_steps:  # the numbers of kept transitions are of another dataset
+        checksum = zlib.crc32(self.replay_buffer.actions.tobytes())
+        if checksum != self._dataset_checksum:  # the numbers of kept transitions are of another dataset
             self._weighted_transitions = WeightedTransitions(self._weighted_transitions.n_batches)
-            self._n_dataset_steps = n_steps
+            self._dataset_checksum = checksum
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)

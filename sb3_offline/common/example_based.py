@@ -63,9 +63,9 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         distinct, rows = np.unique(drawn, return_inverse=True)
         return self._examples_at(distinct), th.as_tensor(rows, device=self.device)
 
-    def _open_data(self) -> None:
-        super()._open_data()
-        self._loaded_examples()
+    def _prepare_data(self) -> None:
+        self._example_arrays = None  # normalised by the statistics of another dataset, perhaps
+        super()._prepare_data()
 
     def _loaded_examples(self) -> dict[str, np.ndarray]:
         if self._example_arrays is None or self._example_source is not self.examples:

@@ -2,9 +2,11 @@
 
 import sys
 import time
+import warnings
 from os import PathLike
 from typing import Any, ClassVar, Literal, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import utils
@@ -110,13 +112,14 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self.random_shift = random_shift
         self._sampler_state: dict[str, Any] | None = None
         self._torch_rng_state: th.Tensor | None = None  # of a saved model, until it goes on learning
+        self._observations_normalized = False  # by a VecNormalize, when it learned
         self._metrics: dict[str, tuple[th.Tensor, int]] = {}
 
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
             raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
         self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
+        super().set_random_seed(self.seed)  # a loaded model keeps the states of its generators
         if self.env is None:
             self.env = self._wrap_env(SpacesOnlyEnv(self.observation_space, self.action_space))
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
@@ -183,6 +186,13 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
                 "The policy was fitted to plain observations, but the environment is a VecNormalize that normalises them; "
                 "use the environment without it, or train a new model with it"
             )
+        is_normalized = normalize is not None and normalize.norm_obs
+        if self._observations_normalized and not is_normalized:
+            raise RuntimeError(
+                "The policy was fitted to observations that a VecNormalize normalised, and the environment is none; "
+                "give that one: set_env, or load(path, env=...)"
+            )
+        self._observations_normalized = is_normalized
         if normalize is None or not normalize.norm_obs:
             self.policy.fit_observation_statistics(self._replay_buffer.observation_statistics)  # type: ignore[operator]
         elif normalize.training:
@@ -193,9 +203,43 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
                 rms.mean, rms.var, rms.count = statistics[key] if key else statistics
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        before = self.env, self._vec_normalize_env
         super().set_env(env, force_reset)
-        if self._replay_buffer is not None:
+        if self._replay_buffer is None:
+            return
+        try:
             self._fit_observation_statistics()
+        except RuntimeError:
+            self.env, self._vec_normalize_env = before
+            raise
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        super().set_random_seed(seed)
+        if seed is None:
+            return
+        # Not as a saved model would have gone on, but anew
+        self._torch_rng_state, self._sampler_state = None, dict(np.random.default_rng(seed).bit_generator.state)
+        if self._replay_buffer is not None:
+            self._replay_buffer.set_rng_state(self._sampler_state)
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """
+        Take from a saved buffer where it was in its data, if these are the model's own; and which data, if the model has none.
+
+        :param path: of the file that ``save_replay_buffer`` wrote
+        :param truncate_last_traj: see :class:`~stable_baselines3.common.off_policy_algorithm.OffPolicyAlgorithm`
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        saved, self.replay_buffer = self._replay_buffer, None
+        if self.dataset is None:
+            self.dataset = saved.datasets
+        own = self.replay_buffer
+        if not np.array_equal(own.actions, saved.actions):
+            warnings.warn(f"{path}: is of other data than the model's dataset, which is learned from; it is not used.")
+            return
+        own.set_rng_state(saved.get_rng_state())
+        if saved.is_relabelled and not own.is_relabelled:
+            own.rewards = saved.rewards
 
     def augment(self, observations: PyTorchObs, max_shift: int | None = None) -> PyTorchObs:
         """
@@ -322,6 +366,30 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._torch_rng_state = th.get_rng_state()
         super().save(path, exclude, include)
         self._torch_rng_state = None
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfOfflineAlgorithm],
+        path: Any,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfOfflineAlgorithm:
+        """
+        Load a saved model, which goes on learning as the saved one would have.
+
+        :param path: as :meth:`stable_baselines3.common.base_class.BaseAlgorithm.load` takes it, and all arguments but these
+        :param kwargs: attributes to replace, such as ``dataset``, ``examples`` or ``reward_fn``; with ``seed`` it goes on with
+            other batches and actions
+        :return: the model
+        """
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if kwargs.get("seed") is not None:
+            model.set_random_seed(kwargs["seed"])
+        return model
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_opened_sources", "_metrics"]

@@ -13,6 +13,7 @@ from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, OfflinePolicy
 from sb3_offline.common.reward_based import RewardBasedAlgorithm
+from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.mixed import MixedDictReplayBuffer, MixedReplayBuffer
 
 #: Standard deviation, before the tanh, of a policy that had none
@@ -69,7 +70,13 @@ def export_sac(
     if data_ratio > 0:
         is_dict = isinstance(model.observation_space, spaces.Dict)
         sac.replay_buffer_class = MixedDictReplayBuffer if is_dict else MixedReplayBuffer
+        buffer = model.replay_buffer
+        if not buffer.has_rewards:
+            problem, remedy = "are missing, but SAC learns from them", "Give a dataset with rewards, or data_ratio=0"
+            raise DatasetError(buffer.datasets[0].path, "rewards", problem, remedy)
         sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
+        if buffer.is_relabelled:  # SAC goes on with the rewards that the critic knows
+            sac.replay_buffer_kwargs["rewards"] = buffer.rewards
     sac.save(Path(path))
 
 

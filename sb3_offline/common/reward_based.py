@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
-from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetSource
 
@@ -50,15 +50,18 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
 
     def _prepare_data(self) -> None:
         super()._prepare_data()
-        self._relabel()
+        self.relabel(self.replay_buffer)
         normalize = self._vec_normalize_env
         if normalize is not None and normalize.norm_reward and normalize.training:
             # Without a rollout, the scale of a VecNormalize has to come from the dataset.
             normalize.ret_rms.var = np.array(self.replay_buffer.return_variance(normalize.gamma))
 
-    def _relabel(self) -> None:
-        """Put the rewards that are learned from in place of the dataset's."""
-        buffer = self.replay_buffer
+    def relabel(self, buffer: OfflineReplayBuffer) -> None:
+        """
+        Put the rewards that this algorithm learns from in place of a dataset's.
+
+        :param buffer: over the model's own dataset, or over another one, to judge the model by
+        """
         if callable(self.reward_fn):
             buffer.relabel(self.reward_fn)
         elif self.reward_fn is not None:

@@ -244,8 +244,13 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     @property
     def has_rewards(self) -> bool:
-        """Whether the files hold rewards."""
-        return self.datasets[0].rewards is not None
+        """Whether there are rewards: in the files, or others in their place."""
+        return self.is_relabelled or self.datasets[0].rewards is not None
+
+    @property
+    def is_relabelled(self) -> bool:
+        """Whether the rewards are others than those of the files."""
+        return self.rewards is not self._file_rewards
 
     def success_rewards(self) -> np.ndarray:
         """
@@ -333,7 +338,7 @@ class OfflineReplayBuffer(ReplayBuffer):
     def __getstate__(self) -> dict[str, Any]:
         options = {"n_steps": self.n_steps, "gamma": self.gamma, "storage": self.storage, "next_actions": self.next_actions}
         arguments = (self.datasets, self.observation_space, self.action_space, str(self.device))
-        rewards = None if self.rewards is self._file_rewards else self.rewards  # relabelled ones are in no file
+        rewards = self.rewards if self.is_relabelled else None  # relabelled ones are in no file
         return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state(), "rewards": rewards}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, TensorDict
@@ -13,12 +14,19 @@ from sb3_offline.data.reader import DatasetSource
 
 
 class _Mixed:
-    def __init__(self, *args: Any, dataset: DatasetSource, data_ratio: float = 0.5, **kwargs: Any):
+    def __init__(
+        self, *args: Any, dataset: DatasetSource, data_ratio: float = 0.5, rewards: np.ndarray | None = None, **kwargs: Any
+    ):
         super().__init__(*args, **kwargs)
         if not 0 <= data_ratio <= 1:
             raise DatasetError("", "data_ratio", f"is {data_ratio}", "Give the share of a batch that the dataset has, 0 to 1")
         self.data_ratio = data_ratio
-        self.offline = OfflineReplayBuffer(dataset, self.observation_space, self.action_space, self.device)  # type: ignore
+        seed = np.random.randint(2**31)  # SB3 seeds NumPy's generator, which its own buffers draw from
+        self.offline = OfflineReplayBuffer(
+            dataset, self.observation_space, self.action_space, self.device, seed=seed  # type: ignore[attr-defined]
+        )
+        if rewards is not None:
+            self.offline.rewards = rewards
         if not self.offline.has_rewards:
             problem, remedy = "are missing, but a learner from rewards asks for them", "Give a dataset with rewards"
             raise DatasetError(self.offline.datasets[0].path, "rewards", problem, remedy)
@@ -51,8 +59,9 @@ class MixedReplayBuffer(_Mixed, ReplayBuffer):
             replay_buffer_kwargs={"dataset": "data.h5", "data_ratio": 0.5})
 
     :param args: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
-    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these; with rewards
+    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these; with rewards, unless others are given
     :param data_ratio: share of each batch that comes from the dataset
+    :param rewards: (steps,) float32, in place of the dataset's
     :param kwargs: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
     """
 

@@ -110,8 +110,9 @@ class OfflineDataset:
         else:
             header, arrays, n_episodes = self._read_hdf5(observation_space, action_space)
         if episodes is not None:
-            arrays = _chosen_rows(arrays, np.asarray(episodes, dtype=np.int64))
-            n_episodes, self.storage = len(episodes), "memory"
+            numbers = self._options["episodes"] = _episode_numbers(episodes, n_episodes, self.path)
+            arrays = _chosen_rows(arrays, numbers)
+            n_episodes, self.storage = len(numbers), "memory"
         self.header = header
         self.observation_space, self.action_space = header.observation_space, header.action_space
         self.env_id, self.env_kwargs, self.provenance = header.env_id, header.env_kwargs, header.provenance
@@ -139,11 +140,12 @@ class OfflineDataset:
 
     def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
         """
-        :param episodes: numbers of episodes of this dataset
+        :param episodes: numbers of episodes of this dataset, or a mask of them
         :return: the same file with these alone, in this order, read into memory
         """
         given = self._options["episodes"]
-        numbers = np.asarray(episodes, dtype=np.int64) if given is None else np.asarray(given)[episodes]
+        numbers = _episode_numbers(episodes, self.n_episodes, self.path)
+        numbers = numbers if given is None else given[numbers]
         return OfflineDataset(self.path, **{**self._options, "episodes": numbers})
 
     def _read_hdf5(
@@ -231,6 +233,20 @@ class OfflineDataset:
 
 def _reopen(path: Path, options: dict[str, Any]) -> OfflineDataset:
     return OfflineDataset(path, **options)
+
+
+def _episode_numbers(episodes: Sequence[int] | np.ndarray, n_episodes: int, path: Path) -> np.ndarray:
+    """:return: int64, the numbers that a list of numbers, or a mask, stands for"""
+    given = np.asarray(episodes)
+    if given.dtype == bool and len(given) != n_episodes:
+        raise DatasetError(
+            path, "episodes", f"is a mask of {len(given)}, but there are {n_episodes}", "Give one flag for each"
+        )
+    numbers = np.flatnonzero(given) if given.dtype == bool else given.astype(np.int64)
+    if ((numbers < 0) | (numbers >= n_episodes)).any():
+        problem = f"names episode {numbers.max() if numbers.min() >= 0 else numbers.min()}"
+        raise DatasetError(path, "episodes", problem, f"Give numbers from 0 to {n_episodes - 1}")
+    return numbers
 
 
 def _chosen_rows(arrays: dict[str, Any], episodes: np.ndarray) -> dict[str, Any]:

@@ -17,7 +17,10 @@ def space_to_json(space: spaces.Space) -> str:
     :param space: a Box, Discrete, MultiDiscrete or MultiBinary space, or a Dict of these
     :return: JSON text; ``space_from_json`` gives an equal space back
     """
-    return json.dumps(_encode(space))
+    text = json.dumps(_encode(space))
+    if space_from_json(text) != space:
+        raise DatasetError("", "space", f"{space} cannot be stored: it would come back as another", "Wrap the environment")
+    return text
 
 
 def space_from_json(text: str) -> spaces.Space:
@@ -35,9 +38,10 @@ def _encode(space: spaces.Space) -> dict[str, Any]:
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
     if isinstance(space, spaces.MultiDiscrete):
-        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
+        start = space.start.tolist()
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": start, "dtype": str(space.dtype)}
     if isinstance(space, spaces.MultiBinary):
-        return {"type": "MultiBinary", "n": [int(n) for n in space.shape]}
+        return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else [int(n) for n in space.shape]}
     if isinstance(space, spaces.Dict) and not any(isinstance(s, spaces.Dict) or "/" in k for k, s in space.items()):
         return {"type": "Dict", "spaces": {key: _encode(subspace) for key, subspace in space.items()}}
     supported = "Box, Discrete, MultiDiscrete, MultiBinary and flat Dict spaces (no '/' in keys)"
@@ -48,12 +52,13 @@ def _decode(data: dict[str, Any]) -> spaces.Space:
     kind = data["type"]
     if kind == "Box":
         shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
-        low, high = (np.broadcast_to(np.array(data[k], dtype=np.float64), shape).astype(dtype) for k in ("low", "high"))
+        exact = np.float64 if dtype.kind == "f" else dtype  # large integers are none of the floats'
+        low, high = (np.broadcast_to(np.array(data[k], dtype=exact), shape).astype(dtype) for k in ("low", "high"))
         return spaces.Box(low, high, shape, dtype.type)
     if kind == "Discrete":
         return spaces.Discrete(data["n"], start=data["start"])
     if kind == "MultiDiscrete":
-        return spaces.MultiDiscrete(data["nvec"])
+        return spaces.MultiDiscrete(data["nvec"], np.dtype(data.get("dtype", "int64")).type, start=data.get("start"))
     if kind == "MultiBinary":
         return spaces.MultiBinary(data["n"])
     if kind == "Dict":
@@ -148,11 +153,7 @@ def check_rows(
     :return: array of shape ``(rows, *shape)``; raises ``DatasetError`` on another shape or dtype, values outside of the
         dtype's range, NaN or infinity
     """
-    array = to_array(value, file, field)
-    if array.ndim == 0 or array.shape[1:] != shape or rows not in (None, len(array)):
-        wanted = ("n" if rows is None else rows, *shape)
-        problem = f"has shape {array.shape}, expected ({', '.join(map(str, wanted))}{',' if not shape else ''})"
-        raise DatasetError(file, field, problem, "Give rows of this shape (and T + 1 rows of observations for T actions)")
+    array = _shaped(value, shape, rows, file, field)
     if array.dtype.kind not in "iubf" or (array.dtype.kind == "f" and dtype.kind in "iu"):
         remedy = "Convert it first (floats in [0, 1] to uint8: (255 * x).round().astype(np.uint8))"
         raise DatasetError(file, field, f"has dtype {array.dtype}, expected {dtype}", remedy)
@@ -170,6 +171,41 @@ def check_rows(
         else:
             _check_range(array, np.iinfo(dtype).min, np.iinfo(dtype).max, file, field)
     return array.astype(dtype, copy=False)
+
+
+def check_extra(
+    value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
+) -> np.ndarray:
+    """
+    :func:`check_rows` for arrays that mean nothing to a learner: their floats may be NaN or infinite, and they may be text.
+
+    :param value: array-like of shape ``(rows, *shape)``
+    :param shape: shape of one row
+    :param dtype: dtype of the result
+    :param rows: expected number of rows, ``None`` for any
+    :param file: for the error message
+    :param field: for the error message
+    :return: array of shape ``(rows, *shape)``
+    """
+    if dtype.kind not in "fS":
+        return check_rows(value, shape, dtype, rows, file, field)
+    array = _shaped(value, shape, rows, file, field)
+    if array.dtype.kind not in ("iubf" if dtype.kind == "f" else "S"):
+        remedy = "Convert it first (text: np.char.encode)"
+        raise DatasetError(file, field, f"has dtype {array.dtype}, expected {dtype}", remedy)
+    if dtype.kind == "S" and array.dtype.itemsize > dtype.itemsize:
+        problem = f"has texts of up to {array.dtype.itemsize} bytes, but the file has room for {dtype.itemsize}"
+        raise DatasetError(file, field, problem, "Shorten them, or declare a longer dtype when creating the file")
+    return array.astype(dtype, copy=False)
+
+
+def _shaped(value: Any, shape: tuple[int, ...], rows: int | None, file: str | os.PathLike, field: str) -> np.ndarray:
+    array = to_array(value, file, field)
+    if array.ndim == 0 or array.shape[1:] != shape or rows not in (None, len(array)):
+        wanted = ("n" if rows is None else rows, *shape)
+        problem = f"has shape {array.shape}, expected ({', '.join(map(str, wanted))}{',' if not shape else ''})"
+        raise DatasetError(file, field, problem, "Give rows of this shape (and T + 1 rows of observations for T actions)")
+    return array
 
 
 def _check_range(array: np.ndarray, low: Any, high: Any, file: str | os.PathLike, field: str) -> None:

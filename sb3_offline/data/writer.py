@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import lock_file, open_hdf5, replacing, temporary_path
 from sb3_offline.data.format import Header, create_file, read_header
-from sb3_offline.data.spaces import check_observations, check_rows, to_array
+from sb3_offline.data.spaces import check_extra, check_observations, check_rows, to_array
 
 COPY_BYTES = 1 << 24
 
@@ -180,7 +180,10 @@ class DatasetWriter:
             if name in expected:
                 raise DatasetError(self.path, name, "is missing from the episode", "Give it, or create the file without it")
             raise DatasetError(self.path, name, "is not an array of this file", "Declare it when creating the file")
-        rows = {name: check_rows(values[name], s.shape, s.dtype, n, self.path, name) for name, s in expected.items()}
+        rows = {}
+        for name, spec in expected.items():
+            check = check_extra if name.startswith("extras/") else check_rows
+            rows[name] = check(values[name], spec.shape, spec.dtype, n, self.path, name)
         for name in ("terminated", "truncated"):
             if rows[name][:-1].any():
                 remedy = "An episode ends with the step that terminates or truncates it: split it there"

@@ -8,7 +8,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
 from sb3_offline.cql.cql import CQL
-from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.dcql.distances import ObservationVectors, mean_distance
 
@@ -67,10 +67,12 @@ class DCQL(ExampleBasedAlgorithm, CQL):
     def _data_sources(self) -> tuple[Any, ...]:
         return (*super()._data_sources(), self.examples)
 
-    def _relabel(self) -> None:
-        buffer, normalize = self.replay_buffer, self._vec_normalize_env
+    def relabel(self, buffer: OfflineReplayBuffer) -> None:
+        normalize = self._vec_normalize_env
         is_normalized = normalize is not None and normalize.norm_obs
-        vectors = ObservationVectors(self.observation_space, None if is_normalized else buffer.observation_statistics)
+        vectors = ObservationVectors(
+            self.observation_space, None if is_normalized else self.replay_buffer.observation_statistics
+        )
         goals = vectors(self.all_examples())
 
         def reward(batch: OfflineSamples) -> th.Tensor:

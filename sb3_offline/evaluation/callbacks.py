@@ -67,6 +67,8 @@ class OfflineEvalCallback(BaseCallback):
             self.buffer = OfflineReplayBuffer(
                 self.dataset, model.observation_space, model.action_space, model.device, gamma=model.gamma
             )
+            if isinstance(model, RewardBasedAlgorithm):
+                model.relabel(self.buffer)
         size = self.buffer.size()
         n = min(self.n_transitions, size)
         self.steps = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
@@ -100,7 +102,7 @@ class OfflineEvalCallback(BaseCallback):
             found["td_error"] = float(np.concatenate([self._td_errors(batch) for batch in batches]).mean())
         if isinstance(model, CEBORL | ORIL):
             found |= self._judge_classifier()
-        if self.buffer.has_rewards or isinstance(model, RewardBasedAlgorithm):
+        if self.buffer.has_rewards:
             found["data_return"] = float(discounted_returns(self.buffer, model.gamma).mean())
             if self.fqe_steps:
                 found["fqe_value"] = float(fitted_q_evaluation(model, self.buffer, self.fqe_steps).mean())

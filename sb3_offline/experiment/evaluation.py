@@ -74,12 +74,16 @@ def evaluate_success(
     """
     env = make_evaluation_env(env_id, env_kwargs, seed)
     successes: list[bool] = []
+    solved = False
 
     def at_step(local: dict[str, Any], _: dict[str, Any]) -> None:
+        nonlocal solved
+        solved |= bool(local["info"].get("is_success"))  # at any step: not every environment keeps it up to the last
         if local["done"]:
             if "is_success" not in local["info"]:
                 raise RuntimeError(f"{env_id} does not say `is_success` in its info, so success cannot be counted")
-            successes.append(bool(local["info"]["is_success"]))
+            successes.append(solved)
+            solved = False
 
     try:
         returns, _ = evaluate_policy(model, env, n_episodes, deterministic=True, callback=at_step, return_episode_rewards=True)

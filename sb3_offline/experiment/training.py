@@ -108,8 +108,8 @@ class EvaluationTable(BaseCallback):
 
 class _ReplaceEarlierRun(BaseCallback):
     """
-    Takes over a folder when the data were found good. Files of an earlier run go first: this one is finished when its own model
-    and tables are there.
+    Takes over a folder when the data were found good. Files of an earlier run go first: this one is finished when its own
+    model and tables are there.
     """
 
     def __init__(self, output: Path, record: dict[str, Any]):

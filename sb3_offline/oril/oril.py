@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
 from sb3_offline.cql.cql import CQL
+from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.oril.losses import classifier_loss
 from sb3_offline.oril.reward_model import RewardClassifier
@@ -82,11 +83,11 @@ class ORIL(ExampleBasedAlgorithm, CQL):
             normalize_images=self.policy.normalize_images,
         ).to(self.device)
 
-    def _relabel(self) -> None:
+    def relabel(self, buffer: OfflineReplayBuffer) -> None:
         if not self.reward_model.trained:
             self._train_reward_model()
         self.reward_model.set_training_mode(False)
-        self.replay_buffer.relabel(lambda batch: self.reward_model(batch.observations).sigmoid(), self._vec_normalize_env)
+        buffer.relabel(lambda batch: self.reward_model(batch.observations).sigmoid(), self._vec_normalize_env)
 
     def _train_reward_model(self) -> None:
         model, encoder = self.reward_model, self.reward_model.features_extractor
