@@ -2,6 +2,7 @@
 
 import csv
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
@@ -125,6 +126,7 @@ def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
 def test_shipped_configs_are_read_and_overwritten():
     assert load_config("ceborl", "MultimodalMetaworld-v0")["policy"] == "MlpPolicy"
     assert load_config("ceborl_pixels", "MultimodalMetaworld-v0")["env_kwargs"]["obs_type"] == "pixels"
+    assert parse_overrides(["policy_kwargs:dict(net_arch=[8])"]) == {"policy_kwargs": {"net_arch": [8]}}
     assert parse_overrides(["tau:0.01", "mu:policy", "policy_kwargs:{'net_arch': [8]}"]) == {
         "tau": 0.01,
         "mu": "policy",
@@ -138,6 +140,29 @@ def test_paper_preset_and_paper_config_are_the_same():
     for name in ("ceborl_paper", "ceborl_paper_pixels"):
         config = load_config(name, "MultimodalMetaworld-v0")
         assert {key: config[key] for key in PAPER_FORM} == PAPER_FORM
+
+
+class Blinks(gym.Env):
+    """Says success at one step in the middle only, in every second episode."""
+
+    observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Box(-1, 1, (1,))
+    n_episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_episodes, self.n_steps = self.n_episodes + 1, 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        solved = self.n_steps == 3 and self.n_episodes % 2 == 1
+        return np.zeros(1, np.float32), 0.0, False, self.n_steps == 5, {"is_success": solved}
+
+
+def test_success_counts_at_any_step():
+    gym.register("Blinks-v0", Blinks)
+    policy = ALGOS["bc"]("MlpPolicy", Blinks())
+    assert evaluate_success(policy, "Blinks-v0", {}, n_episodes=4).successes == [True, False, True, False]
 
 
 def test_success_interval_is_wilsons():

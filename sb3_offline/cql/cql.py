@@ -131,9 +131,13 @@ class CQL(RewardBasedAlgorithm):
         if learned:
             number = str(setting).removeprefix("auto").removeprefix("_") or 1.0
         try:
-            log = th.tensor([float(number)], device=self.device).log()
+            number = float(number)
+            if number < 0:
+                raise ValueError(f"{number} is negative")
         except ValueError as error:
-            raise TypeError(f"{type(self).__name__}: {name} is {setting!r}; give a number, 'auto' or 'auto_0.1'") from error
+            problem = f"{type(self).__name__}: {name} is {setting!r}; give a number of at least 0, 'auto' or 'auto_0.1'"
+            raise TypeError(problem) from error
+        log = th.tensor([number], device=self.device).log()
         return log, th.optim.Adam([log.requires_grad_()], lr=self.lr_schedule(1)) if learned else None
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:

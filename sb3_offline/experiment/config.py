@@ -52,12 +52,16 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
     missing = {"policy", "n_timesteps"} - section.keys()
     if missing:
         raise RuntimeError(f"{path}: its section for {env_id} lacks {', '.join(sorted(missing))}; add it")
-    return dict(section)
+    # Files of the RL Zoo write these as Python: "dict(net_arch=[64, 64])"
+    return {
+        key: _value(value) if key == "policy_kwargs" and isinstance(value, str) else value for key, value in section.items()
+    }
 
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     """
-    :param pairs: ``key:value`` as in the RL Zoo's ``--hyperparams``; values are Python literals, or else strings
+    :param pairs: ``key:value`` as in the RL Zoo's ``--hyperparams``; values are Python literals, ``dict(name=literal)``, or
+        else strings
     :return: the same as a dict
     """
     overrides = {}
@@ -65,8 +69,16 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
         key, colon, text = pair.partition(":")
         if not colon or not key:
             raise RuntimeError(f"{pair!r} is not of the form key:value")
-        try:
-            overrides[key] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            overrides[key] = text
+        overrides[key] = _value(text)
     return overrides
+
+
+def _value(text: str) -> Any:
+    """:return: what a Python literal, or ``dict(name=literal)``, says; any other text as it is"""
+    try:
+        call = ast.parse(text.strip(), mode="eval").body
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "dict" and not call.args:
+            return {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
