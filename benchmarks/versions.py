@@ -33,11 +33,11 @@ def load(checkout: Path) -> ModuleType:
         del sys.path[0]
 
 
-def milliseconds(model: object, steps: int) -> float:
-    model.train(1, 256)  # type: ignore[attr-defined]  (what the model before left in the caches is not counted)
+def milliseconds(model: object, steps: int, batch_size: int) -> float:
+    model.train(1, batch_size)  # type: ignore[attr-defined]  (what the model before left in the caches is not counted)
     began = time.thread_time()
     for _ in range(steps):
-        model.train(1, 256)  # type: ignore[attr-defined]
+        model.train(1, batch_size)  # type: ignore[attr-defined]
     return 1e3 * (time.thread_time() - began) / steps
 
 
@@ -47,6 +47,7 @@ def main() -> None:
     parser.add_argument("learners", nargs="+", help="names of algorithms, with _bf16 at the end for bfloat16")
     parser.add_argument("--kind", choices=STEPS, default="states")
     parser.add_argument("--pairs", type=int, default=20)
+    parser.add_argument("--batch-size", type=int, default=256, help="transitions, and examples, in a batch")
     args = parser.parse_args()
     th.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -62,11 +63,13 @@ def main() -> None:
                 if algo == "in_sample":
                     algo, kwargs = "ceborl", {"beta": 0.0}
                 both.append(throughput.ours(algo, args.kind, data, name.endswith("_bf16"), **kwargs))
+                if algo in ("ceborl", "rce"):
+                    both[-1].example_batch_size = args.batch_size  # type: ignore[attr-defined]
         steps = STEPS[args.kind]
         times = {name: np.empty((args.pairs, 2)) for name in models}
         for pair in range(args.pairs):
             for name, both in models.items():
-                times[name][pair] = [milliseconds(model, steps) for model in both]
+                times[name][pair] = [milliseconds(model, steps, args.batch_size) for model in both]
     for name, pairs in times.items():
         (before, after), (low, ratio, high) = pairs.min(axis=0), np.quantile(pairs[:, 0] / pairs[:, 1], (0.25, 0.5, 0.75))
         print(
