@@ -20,7 +20,7 @@ from sb3_offline.ceborl.losses import (
 from sb3_offline.ceborl.resampling import WeightedTransitions
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
 from sb3_offline.common.losses import expectile_loss
-from sb3_offline.data.buffer import OfflineSamples
+from sb3_offline.data.buffer import OfflineSamples, joined
 from sb3_offline.data.reader import DatasetSource
 
 #: The paper's Eq. 10 and 11 as its appendix trains them, as constructor arguments.
@@ -233,7 +233,8 @@ class CEBORL(ExampleBasedAlgorithm):
             observations = self.augment(batch.observations)
             examples, example_rows = self.sample_examples()
             examples = self.augment(examples)
-            features, distinct_features = self.critic.encode(_joined([observations, examples])).tensor_split([batch_size])
+            # One pass of the encoder: its weights take longer than the images of a small batch
+            features, distinct_features = self.critic.encode(joined([observations, examples])).tensor_split([batch_size])
             example_features = distinct_features[example_rows]
             with th.no_grad():
                 example_policy_features = self._policy_features(examples, example_features, example_rows)
@@ -340,7 +341,7 @@ class CEBORL(ExampleBasedAlgorithm):
             assert batch.nstep_observations is not None
             successors, dataset_actions = [*successors, batch.nstep_observations], [*dataset_actions, batch.nstep_actions]
         successors = [self.augment(observations) for observations in successors]
-        successors_together = _joined(successors)
+        successors_together = joined(successors)
         features = self.critic_target.encode(successors_together)
         if self.backup == "expectile":
             logits = self.critic_target.state_values(features).unsqueeze(0)
@@ -377,10 +378,3 @@ class CEBORL(ExampleBasedAlgorithm):
             omega_p50=p50,
             omega_p99=p99,
         )
-
-
-def _joined(batches: list[PyTorchObs]) -> PyTorchObs:
-    """:return: one batch of all, for one pass of an encoder: its weights take longer than the images of a small batch"""
-    if isinstance(batches[0], dict):
-        return {key: th.cat([batch[key] for batch in batches]) for key in batches[0]}  # type: ignore[index]
-    return th.cat(batches)  # type: ignore[arg-type]

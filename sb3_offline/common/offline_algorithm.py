@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Pr
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_offline.common.augmentation import shift_observations
 from sb3_offline.common.process import prepare_process
@@ -181,18 +182,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     def _fit_observation_statistics(self) -> None:
         normalize = self._vec_normalize_env
-        if normalize is not None and normalize.norm_obs and self.policy.standardizes:  # type: ignore[operator]
-            raise RuntimeError(
-                "The policy was fitted to plain observations, but the environment is a VecNormalize that normalises them; "
-                "use the environment without it, or train a new model with it"
-            )
-        is_normalized = normalize is not None and normalize.norm_obs
-        if self._observations_normalized and not is_normalized:
-            raise RuntimeError(
-                "The policy was fitted to observations that a VecNormalize normalised, and the environment is none; "
-                "give that one: set_env, or load(path, env=...)"
-            )
-        self._observations_normalized = is_normalized
+        self._check_normalizer(normalize)
+        self._observations_normalized = _normalizes(normalize)
         if normalize is None or not normalize.norm_obs:
             self.policy.fit_observation_statistics(self._replay_buffer.observation_statistics)  # type: ignore[operator]
         elif normalize.training:
@@ -202,16 +193,25 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             for key, rms in running.items():
                 rms.mean, rms.var, rms.count = statistics[key] if key else statistics
 
+    def _check_normalizer(self, normalize: VecNormalize | None) -> None:
+        """Raise where the policy was fitted to other observations than these."""
+        if _normalizes(normalize) and self.policy.standardizes:  # type: ignore[operator]
+            raise RuntimeError(
+                "The policy was fitted to plain observations, but the environment is a VecNormalize that normalises them; "
+                "use the environment without it, or train a new model with it"
+            )
+        if self._observations_normalized and not _normalizes(normalize):
+            raise RuntimeError(
+                "The policy was fitted to observations that a VecNormalize normalised, and the environment is none; "
+                "give that one: set_env, or load(path, env=...)"
+            )
+
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        before = self.env, self._vec_normalize_env
+        if self._replay_buffer is not None:  # before it is taken
+            self._check_normalizer(unwrap_vec_normalize(env))  # type: ignore[arg-type]
         super().set_env(env, force_reset)
-        if self._replay_buffer is None:
-            return
-        try:
+        if self._replay_buffer is not None:
             self._fit_observation_statistics()
-        except RuntimeError:
-            self.env, self._vec_normalize_env = before
-            raise
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
@@ -399,6 +399,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer"], []
+
+
+def _normalizes(normalize: VecNormalize | None) -> bool:
+    """:return: whether an environment normalises observations"""
+    return normalize is not None and normalize.norm_obs
 
 
 class _GradientStepBar(ProgressBarCallback):

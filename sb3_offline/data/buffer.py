@@ -347,6 +347,13 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.rewards = self.rewards if state["rewards"] is None else state["rewards"]
 
 
+def joined(batches: Sequence[Observations]) -> Observations:
+    """:return: one batch of all"""
+    if isinstance(batches[0], dict):
+        return {key: th.cat([batch[key] for batch in batches]) for key in batches[0]}  # type: ignore[index, call-overload]
+    return th.cat(list(batches))  # type: ignore[arg-type]
+
+
 def _plain_shape(space: spaces.Space) -> tuple[int, ...]:
     """:return: SB3's shape of one observation of a space that is not a Dict: (1,) for Discrete"""
     return get_obs_shape(space)  # type: ignore[return-value]

@@ -3,12 +3,11 @@
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples, TensorDict
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.buffer import OfflineReplayBuffer, joined
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetSource
 
@@ -42,13 +41,7 @@ class _Mixed:
         parts = [self.offline.sample(n_data, env)[:5]] if n_data else []
         if n_data < batch_size:
             parts.append(super().sample(batch_size - n_data, env)[:5])  # type: ignore[misc]
-        return ReplayBufferSamples(*(_joined(fields) for fields in zip(*parts, strict=True)))  # type: ignore[arg-type]
-
-
-def _joined(fields: tuple[Any, ...]) -> th.Tensor | TensorDict:
-    if isinstance(fields[0], dict):
-        return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
-    return th.cat(fields)
+        return ReplayBufferSamples(*(joined(fields) for fields in zip(*parts, strict=True)))  # type: ignore[arg-type]
 
 
 class MixedReplayBuffer(_Mixed, ReplayBuffer):

@@ -177,15 +177,8 @@ def check_extra(
     value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
 ) -> np.ndarray:
     """
-    :func:`check_rows` for arrays that mean nothing to a learner: their floats may be NaN or infinite, and they may be text.
-
-    :param value: array-like of shape ``(rows, *shape)``
-    :param shape: shape of one row
-    :param dtype: dtype of the result
-    :param rows: expected number of rows, ``None`` for any
-    :param file: for the error message
-    :param field: for the error message
-    :return: array of shape ``(rows, *shape)``
+    :func:`check_rows`, with the same arguments, for arrays that mean nothing to a learner: their floats may be NaN or
+    infinite, and they may be text.
     """
     if dtype.kind not in "fS":
         return check_rows(value, shape, dtype, rows, file, field)

@@ -52,10 +52,10 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
     missing = {"policy", "n_timesteps"} - section.keys()
     if missing:
         raise RuntimeError(f"{path}: its section for {env_id} lacks {', '.join(sorted(missing))}; add it")
-    # Files of the RL Zoo write these as Python: "dict(net_arch=[64, 64])"
-    return {
-        key: _value(value) if key == "policy_kwargs" and isinstance(value, str) else value for key, value in section.items()
-    }
+    config = dict(section)
+    if isinstance(config.get("policy_kwargs"), str):  # files of the RL Zoo write Python: "dict(net_arch=[64, 64])"
+        config["policy_kwargs"] = _value(config["policy_kwargs"])
+    return config
 
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
