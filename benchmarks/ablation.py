@@ -97,22 +97,22 @@ def main() -> None:
         examples=args.examples,
     )
     train = None if args.no_training else functools.partial(train_locally, n_workers=args.workers)
-    for line in run_grid(grid, args.runs, args.output, train, write_variants):
+    table = args.runs / "table.csv"
+    for line in run_grid(grid, args.runs, table, train):
+        write_variants(table, args.output)
         print(line, flush=True)
     plot(args.output, args.figure)
 
 
-def write_variants(path: Path, rows: list[dict[str, Any]]) -> None:
+def write_variants(table: Path, output: Path) -> None:
     """
-    :param path: of the CSV file
-    :param rows: of a grid whose methods are variants
+    :param table: CSV file of a grid whose methods are variants
+    :param output: gets it with the group of each
     """
     groups = {name: group for group, members in GROUPS.items() for name in members}
-    write_table(path, [{"group": groups[row["method"]], **_renamed(row)} for row in rows], FIELDS)
-
-
-def _renamed(row: dict[str, Any]) -> dict[str, Any]:
-    return {"variant" if name == "method" else name: value for name, value in row.items()}
+    with table.open(newline="") as file:
+        rows = [{"variant": row.pop("method"), **row} for row in csv.DictReader(file)]
+    write_table(output, [{"group": groups[row["variant"]], **row} for row in rows], FIELDS)
 
 
 def plot(table: Path, figure: Path) -> None:

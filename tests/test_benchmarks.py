@@ -10,6 +10,7 @@ import ablation
 import tables
 
 from sb3_offline.benchmark.grid import merged
+from sb3_offline.benchmark.table import write_table
 
 
 def test_rates_are_means_over_seeds_with_their_range():
@@ -39,6 +40,7 @@ def test_every_row_of_the_ablation_has_a_bar(tmp_path):
 
 def test_the_ablation_names_group_and_variant(tmp_path):
     row = dict.fromkeys(("task", "seed", "step", "episodes", "successes", "config", "commit", "versions"), "1")
-    ablation.write_variants(tmp_path / "table.csv", [{"method": "beta = 1", **row}])
-    with (tmp_path / "table.csv").open() as file:
+    write_table(tmp_path / "table.csv", [{"method": "beta = 1", **row}])
+    ablation.write_variants(tmp_path / "table.csv", tmp_path / "ablation.csv")
+    with (tmp_path / "ablation.csv").open() as file:
         assert list(csv.DictReader(file)) == [{"group": "penalty (a)", "variant": "beta = 1", **row}]

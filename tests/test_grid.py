@@ -121,11 +121,15 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     for row in [*rows, *again]:
         del row["commit"]  # the failed run was tried again, perhaps on another one
     assert again == rows and model.stat().st_mtime_ns == before
-    # A part of the grid leaves the rows of the others
+    # A part of the grid leaves the rows of the others, also among all evaluations
+    curves = (tmp_path / "table_curves.csv").read_text()
+    assert [line.split(",")[:4] for line in curves.splitlines()[1:]] == [
+        [name, "door-open", "3", step] for name in ("bc", "ceborl") for step in ("10", "20", "30", "40")
+    ]
     part = run_benchmark(tmp_path, grid, "--no-training", "--methods", "bc", "--tasks", "door-open")
     for row in part:
         del row["commit"]
-    assert part == rows
+    assert part == rows and (tmp_path / "table_curves.csv").read_text() == curves
     # Other hyperparameters are another run: the table has it when it is there
     methods["ceborl"] = {**methods["ceborl"], "changes": {"batch_size": 5}}
     grid = write_grid(tmp_path, data, methods=methods)
@@ -198,7 +202,7 @@ def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
             assert picture.width > 200 and name in text
     results = read_results(tmp_path / "table.csv")
     assert [*results.cells["bc", "door-open"].by("step")] == [3, 4]
-    assert [*with_early_checkpoints(results, tmp_path / "runs").cells["bc", "door-open"].by("step")] == [1, 2, 3, 4]
+    assert [*with_early_checkpoints(results, tmp_path / "table.csv").cells["bc", "door-open"].by("step")] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,7 @@ class Run:
         grid, config = self.grid, self.arguments["config"]
         n_early, seed = grid.checkpoints, self.arguments["seed"]  # those of the first half are for the learning curve
         return EvaluationTable(
-            evaluations_file(self.folder, task),
+            self.folder / f"evaluations-{task}.csv",
             grid.env,
             {**config.get("env_kwargs", {}), "task": task},
             eval_freq=grid.n_timesteps // (2 * grid.checkpoints),
@@ -255,15 +255,6 @@ def evaluation_seed(seed: int, checkpoint: int) -> int:
     :return: seed of that evaluation's episodes
     """
     return EVALUATION_SEED + 1000 * (1 + seed) + checkpoint
-
-
-def evaluations_file(folder: Path, task: str) -> Path:
-    """
-    :param folder: of a run
-    :param task: that it is evaluated on
-    :return: the CSV file of all its evaluations, also of those that do not count
-    """
-    return folder / f"evaluations-{task}.csv"
 
 
 def cell_folder(runs: Path, method: str, task: str, seed: int) -> Path:

@@ -3,10 +3,9 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from sb3_offline.benchmark.grid import Grid, Run, plan
-from sb3_offline.benchmark.table import failure_of, rows_outside, table_rows, write_table
+from sb3_offline.benchmark.table import failure_of, table_writer
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.policy_file import save_policy
 from sb3_offline.experiment.training import load_run
@@ -17,34 +16,28 @@ def run_grid(
     runs: Path,
     output: Path,
     train: Callable[[list[Run]], Iterable[Run]] | None,
-    write: Callable[[Path, list], None] = write_table,
     whole: Grid | None = None,
 ) -> Iterator[str]:
     """
-    Train what is not finished, and write the table at once and after every run.
+    Train what is not finished, and write the table at once and after every run; all evaluations, for learning curves, go to
+    :func:`~sb3_offline.benchmark.table.curves_file`.
 
     :param grid: what is asked for
     :param runs: folder of the runs
     :param output: CSV file
     :param train: trains runs and gives back each when it is over; ``None`` to write the table of what is finished
-    :param write: gets ``output`` and the rows of :func:`~sb3_offline.benchmark.table.table_rows`
     :param whole: the grid that ``grid`` is a part of; rows in ``output`` of its other cells stay
     :return: what to tell the user, when it happens
     """
     cells, began = plan(grid, runs), time.monotonic()
-    kept = rows_outside(output, grid, whole) if whole else []
-    order = {cell: number for number, cell in enumerate((whole or grid).cells())}
-
-    def rows() -> list[dict[str, Any]]:
-        return sorted([*kept, *table_rows(cells)], key=lambda row: order[row["method"], row["task"], int(row["seed"])])
-
+    write = table_writer(output, cells, whole or grid)
     trainings = list({run.folder: run for run in cells.values()}.values())
     unfinished = [run for run in trainings if not run.is_finished()] if train else []
     _check_files(unfinished)
-    write(output, rows())
+    write()
     yield f"{len(trainings)} runs fill {len(cells)} cells; {len(unfinished)} are to be trained"
     for number, run in enumerate(train(unfinished) if train else [], start=1):
-        write(output, rows())
+        write()
         minutes = (time.monotonic() - began) / 60
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
 

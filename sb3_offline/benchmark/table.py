@@ -1,8 +1,8 @@
-"""The CSV file of a grid: a row for each checkpoint that counts."""
+"""The CSV files of a grid: a row for each checkpoint that counts, and beside it one for each evaluation."""
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,26 @@ from sb3_offline.data.files import replacing
 from sb3_offline.experiment.training import recorded_run
 
 FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
+CURVE_FIELDS = ("method", "task", "seed", "step", "episodes", "successes")
+
+
+def table_writer(output: Path, cells: Mapping[tuple[str, str, int], Run], whole: Grid) -> Callable[[], None]:
+    """
+    :param output: the table's CSV file
+    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
+    :param whole: the grid that these are a part of; rows of its other cells stay
+    :return: writes the table and the file of all evaluations beside it, as things stand
+    """
+    order = {cell: number for number, cell in enumerate(whole.cells())}
+    files = [(output, FIELDS, table_rows), (curves_file(output), CURVE_FIELDS, curve_rows)]
+    kept = {path: _rows_of(path, {*order} - {*cells}, fields) for path, fields, _ in files}
+
+    def write() -> None:
+        for path, fields, rows_of in files:
+            rows = [*kept[path], *rows_of(cells)]
+            write_table(path, sorted(rows, key=lambda row: order[row["method"], row["task"], int(row["seed"])]), fields)
+
+    return write
 
 
 def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]]:
@@ -39,21 +59,43 @@ def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]
     return rows
 
 
-def rows_outside(path: Path, part: Grid, whole: Grid) -> list[dict[str, Any]]:
+def curve_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]]:
+    """
+    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
+    :return: rows of :data:`CURVE_FIELDS` of the cells that are finished or have failed: all their evaluations, also those of
+        the first half of a run, which do not count
+    """
+    rows = []
+    for (method, task, seed), run in cells.items():
+        if run.is_finished() or (failure_of(run) and recorded_run(run.folder) == run.record()):
+            named = {"method": method, "task": task, "seed": seed}
+            found = run.table(task).rows(run.grid.n_timesteps)
+            rows += [{**named, **{name: int(row[name]) for name in CURVE_FIELDS[3:]}} for row in found]
+    return rows
+
+
+def curves_file(table: Path) -> Path:
+    """
+    :param table: CSV file of a grid
+    :return: the file of all its evaluations, which stands beside it
+    """
+    return table.with_name(f"{table.stem}_curves.csv")
+
+
+def _rows_of(path: Path, wanted: set[tuple[str, str, int]], fields: Sequence[str]) -> list[dict[str, Any]]:
     """
     :param path: of the CSV file of an earlier call, if there was one
-    :param part: of a grid
-    :param whole: the grid
-    :return: rows in the file of the grid's cells that the part leaves out
+    :param wanted: cells
+    :param fields: columns of the file
+    :return: rows in the file of these cells
     """
     if not path.is_file():
         return []
-    outside = {*whole.cells()} - {*part.cells()}
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        if reader.fieldnames is None or [*reader.fieldnames] != [*FIELDS]:
+        if reader.fieldnames is None or [*reader.fieldnames] != [*fields]:
             raise RuntimeError(f"{path}: is no table of sb3-offline benchmark, which would replace it; name another --output")
-        return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in outside]
+        return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in wanted]
 
 
 def failure_of(run: Run) -> str | None:

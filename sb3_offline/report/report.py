@@ -31,9 +31,7 @@ def write_report(
     for table, results, folder in zip_longest(tables, contents, runs):
         yield f"{table}: {len(results.cells)} cells"
         parts += _section(results, output, reference)
-        figures.plot_curves(
-            with_early_checkpoints(results, folder) if folder else results, output / f"{results.name}_curves.png"
-        )
+        figures.plot_curves(with_early_checkpoints(results, table), output / f"{results.name}_curves.png")
         if folder is not None:
             yield f"Playing the final policies in {folder}"
             parts += _episodes(results, folder, output)

@@ -6,7 +6,7 @@ from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
-from sb3_offline.benchmark.grid import cell_folder, evaluations_file
+from sb3_offline.benchmark.table import curves_file
 from sb3_offline.experiment.evaluation import success_interval
 
 COUNTS = ("episodes", "successes")
@@ -128,20 +128,20 @@ def read_results(path: Path) -> Results:
     return Results(path.stem, rows)
 
 
-def with_early_checkpoints(results: Results, runs: Path) -> Results:
+def with_early_checkpoints(results: Results, table: Path) -> Results:
     """
     :param results: ours
-    :param runs: folder of the runs
-    :return: with a row for each evaluation in there of a step before those that count
+    :param table: the CSV file that they are of
+    :return: with a row for each evaluation of a step before those that count, where the file of all evaluations is there
     """
-    first, early = min(int(row["step"]) for row in results.rows), []
-    for (method, task), cell in results.cells.items():
-        for seed in cell.by("seed"):
-            file = evaluations_file(cell_folder(runs, method, task, seed), task)
-            if file.is_file():
-                with file.open(newline="") as lines:
-                    named = {"method": method, "task": task, "seed": str(seed), "config": ""}
-                    early += [{**row, **named} for row in csv.DictReader(lines) if int(row["step"]) < first]
+    path = curves_file(table)
+    if not path.is_file():
+        return results
+    first = min(int(row["step"]) for row in results.rows)
+    counted = {(row["method"], row["task"], row["seed"]) for row in results.rows}
+    with path.open(newline="") as file:
+        early = [{**row, "config": ""} for row in csv.DictReader(file) if int(row["step"]) < first]
+    early = [row for row in early if (row["method"], row["task"], row["seed"]) in counted]
     return Results(results.name, [*results.rows, *early])
 
 
