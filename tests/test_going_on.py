@@ -8,7 +8,7 @@ from data_files import write_dataset
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_algorithms import STATES, ForbiddenEnv
 
-from sb3_offline import CEBORL, CQL
+from sb3_offline import CEBORL, CQL, TD3BC
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
 
@@ -25,7 +25,7 @@ def paths(tmp_path):
 
 
 def weights(model):
-    return th.cat([parameter.flatten() for parameter in model.policy.parameters()])
+    return th.cat([parameter.flatten() for parameter in getattr(model, "policy", model).parameters()])
 
 
 def test_a_saved_buffer_brings_its_place_and_no_other_data(paths, tmp_path):
@@ -60,6 +60,19 @@ def test_kept_transitions_are_those_of_the_dataset(paths, tmp_path):
         again.learn(1, reset_num_timesteps=False)
         kept.append(len(again._weighted_transitions.steps))
     assert kept == [4, 1]
+    shorter = CEBORL.load(tmp_path / "model", examples=examples, policy_batches=2).learn(3)
+    assert len(shorter._weighted_transitions.steps) == 2
+
+
+def test_a_loaded_model_takes_another_delay(paths, tmp_path):
+    TD3BC("MlpPolicy", None, paths[0], **SMALL).save(tmp_path / "model")
+    model = TD3BC.load(tmp_path / "model", policy_delay=3)
+    before = {name: weights(getattr(model, name)) for name in ("actor", "critic_target")}
+    for steps, moved in ((2, False), (1, True)):
+        model.learn(steps, reset_num_timesteps=False)
+        assert {name: not th.equal(weights(getattr(model, name)), then) for name, then in before.items()} == dict.fromkeys(
+            before, moved
+        )
 
 
 def test_a_seed_makes_a_loaded_model_go_on_otherwise(paths, tmp_path):

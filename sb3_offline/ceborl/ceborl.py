@@ -194,6 +194,7 @@ class CEBORL(ExampleBasedAlgorithm):
         self.weight_max = weight_max
         self.state_exponent = state_exponent
         self.policy_random_shift = policy_random_shift
+        self.policy_batches = policy_batches
         self._weighted_transitions = WeightedTransitions(policy_batches)
         self._dataset_checksum: int | None = None
         self.ent_coef = ent_coef
@@ -220,8 +221,9 @@ class CEBORL(ExampleBasedAlgorithm):
     def _prepare_data(self) -> None:
         super()._prepare_data()
         checksum = zlib.crc32(self.replay_buffer.actions.tobytes())
-        if checksum != self._dataset_checksum:  # the numbers of kept transitions are of another dataset
-            self._weighted_transitions = WeightedTransitions(self._weighted_transitions.n_batches)
+        # The numbers of kept transitions are of another dataset, or a loaded model is to keep more or fewer
+        if (checksum, self.policy_batches) != (self._dataset_checksum, self._weighted_transitions.n_batches):
+            self._weighted_transitions = WeightedTransitions(self.policy_batches)
             self._dataset_checksum = checksum
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:

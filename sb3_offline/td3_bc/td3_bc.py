@@ -91,7 +91,6 @@ class TD3BC(RewardBasedAlgorithm):
             tau=tau,
             gamma=gamma,
             n_steps=n_steps,
-            target_update_interval=policy_delay,
             random_shift=random_shift,
             dataset_storage=dataset_storage,
             policy_kwargs=policy_kwargs,
@@ -108,6 +107,10 @@ class TD3BC(RewardBasedAlgorithm):
 
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        self.target_update_interval = self.policy_delay  # also of a model that is loaded with another one
+        super()._setup_model()
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
