@@ -163,6 +163,16 @@ def test_shipped_configs_fit_their_algorithm(algo, files):
         create_model(algo, config, dataset, examples if needs_examples(algo) else None)
 
 
+@pytest.mark.parametrize(("text", "at_the_end"), [("lin_1e-2", 0.0), ("1e-2", 1e-2)])  # YAML takes 1e-2 for text
+def test_a_config_may_let_the_learning_rate_fall(text, at_the_end, files):
+    config = {"policy": "MlpPolicy", "learning_rate": text, "batch_size": 4}
+    model = create_model("bc", config, files["MlpPolicy"][0])
+    assert model.actor.optimizer.param_groups[0]["lr"] == 1e-2
+    assert model.learn(10).actor.optimizer.param_groups[0]["lr"] == pytest.approx(at_the_end, abs=2e-3)
+    with pytest.raises(RuntimeError, match="learning_rate is 'cosine'; give a number"):
+        create_model("bc", {**config, "learning_rate": "cosine"}, files["MlpPolicy"][0])
+
+
 @pytest.mark.parametrize("algo", ALGOS)
 def test_actions_of_two_axes_and_networks_without_hidden_layers(algo, tmp_path):
     actions, rng = spaces.Box(-1, 1, (2, 3), np.float32), np.random.default_rng(0)

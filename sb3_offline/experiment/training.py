@@ -10,6 +10,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_offline
 from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
@@ -187,10 +188,21 @@ def create_model(
     """
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
     arguments = {**arguments, "env": None, **_data_arguments(config, dataset, examples), "seed": seed, **kwargs}
+    if isinstance(arguments.get("learning_rate"), str):
+        arguments["learning_rate"] = _learning_rate(arguments["learning_rate"])
     try:
         return find_algorithm(algo)(**arguments)
     except TypeError as error:
         raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams, --dataset and --examples") from error
+
+
+def _learning_rate(text: str) -> float | LinearSchedule:
+    """:return: what "lin_3e-4" means to the RL Zoo: a rate that falls to 0; or, without its prefix, the number"""
+    try:
+        value = float(text.removeprefix("lin_"))
+    except ValueError:
+        raise RuntimeError(f"learning_rate is {text!r}; give a number, or lin_NUMBER for one that falls to 0") from None
+    return LinearSchedule(value, 0.0, 1.0) if text.startswith("lin_") else value
 
 
 def _data_arguments(config: dict[str, Any], dataset: Any, examples: Any) -> dict[str, Any]:
