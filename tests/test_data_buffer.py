@@ -194,6 +194,14 @@ def test_other_spaces_than_the_learners(tmp_path, observation_space, action_spac
         OfflineReplayBuffer(tmp_path / "a.h5", observation_space, action_space, "cpu")
 
 
+def test_discrete_observations_of_another_number_are_refused(tmp_path):
+    with DatasetWriter(tmp_path / "a.h5", spaces.Discrete(5), ACTIONS, success=False, rewards=False) as writer:
+        writer.add_episode(np.array([0, 4]), np.zeros((1, 2)))
+    with pytest.raises(DatasetError, match=r"observations: is Discrete\(5\), but the learner has Discrete\(3\)"):
+        OfflineReplayBuffer(tmp_path / "a.h5", spaces.Discrete(3), ACTIONS, "cpu")
+    assert OfflineReplayBuffer(tmp_path / "a.h5", spaces.Discrete(5), ACTIONS, "cpu").size() == 1
+
+
 def test_action_spaces_of_other_precision_are_the_same(tmp_path):
     write_dataset(tmp_path / "a.h5")
     learner = spaces.Box(ACTIONS.low.astype(np.float64), ACTIONS.high.astype(np.float64), dtype=np.float64)

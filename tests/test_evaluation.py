@@ -1,10 +1,14 @@
 """Judging without an environment, against what is known exactly."""
 
+import csv
+
 import numpy as np
 import pytest
 import torch as th
 from data_files import make_episode, write_dataset
 from gymnasium import spaces
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 from test_algorithms import ACTIONS, POLICIES, files, make  # noqa: F401
 
 from sb3_offline import BC, CQL, IQL
@@ -62,10 +66,17 @@ def test_a_run_is_the_same_with_and_without_and_logs_what_applies(files, tmp_pat
     for algo, names in wanted.items():
         examples = files["MlpPolicy"][1]
         callback = OfflineEvalCallback(str(tmp_path / "held_out.h5"), examples, eval_freq=2, fqe_steps=2)
-        model = make(algo, "MlpPolicy", files).learn(3, callback, log_interval=None)
-        logged = {name.split("/")[1]: value for name, value in model.logger.name_to_value.items() if "offline_eval" in name}
-        assert logged.keys() == names and np.isfinite(list(logged.values())).all()
-        plain = make(algo, "MlpPolicy", files).learn(3, log_interval=None)
+        model = make(algo, "MlpPolicy", files)
+        model.set_logger(configure(str(tmp_path / algo), ["csv"]))
+        model.learn(5, callback, log_interval=3)
+        with (tmp_path / algo / "progress.csv").open() as file:
+            rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
+        logged = {int(row["time/total_timesteps"]): row for row in rows if "offline_eval/data_return" in row}
+        assert logged.keys() == {2, 4}  # each under its own step, whenever the rest is logged
+        for row in logged.values():
+            found = {name.split("/")[1]: float(value) for name, value in row.items() if "offline_eval" in name}
+            assert found.keys() == names and np.isfinite(list(found.values())).all()
+        plain = make(algo, "MlpPolicy", files).learn(5, log_interval=None)
         for name, value in model.policy.state_dict().items():
             assert th.equal(value, plain.policy.state_dict()[name]), name
 
@@ -89,6 +100,9 @@ def test_td_error_and_returns_are_those_of_their_definition(tmp_path):
     for start, n in zip(dataset.step_starts, dataset.lengths, strict=True):
         returns.append(sum(GAMMA**t * dataset.rewards[start + t] for t in range(n)))
     assert found["data_return"] == pytest.approx(np.mean(returns), rel=1e-5)
+    env = VecNormalize(model.get_env(), norm_obs=False)
+    model.set_env(env)
+    assert callback.evaluate()["data_return"] == pytest.approx(np.mean(returns) / np.sqrt(env.ret_rms.var + 1e-8), rel=1e-5)
 
 
 def test_probabilities_are_judged_by_what_they_say():

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 import torch as th
 from data_files import write_dataset
+from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_algorithms import STATES, ForbiddenEnv
 
-from sb3_offline import CEBORL, CQL, TD3BC
+from sb3_offline import CEBORL, CQL, DCQL, TD3BC
+from sb3_offline.data.errors import DatasetError
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
 
@@ -85,6 +87,41 @@ def test_a_seed_makes_a_loaded_model_go_on_otherwise(paths, tmp_path):
     model = CQL.load(tmp_path / "model")
     model.set_random_seed(1)
     assert th.equal(weights(model.learn(2)), ends[2])
+
+
+def test_another_normaliser_counts_for_all_that_is_learned_from(paths, tmp_path):
+    def normaliser(mean):
+        env = VecNormalize(DummyVecEnv([lambda: ForbiddenEnv(STATES, allowed=True)]), norm_obs=mean is not None)
+        if mean is not None:
+            env.obs_rms.mean[:] = mean
+        env.training = mean is None  # or its statistics would be the dataset's
+        return env
+
+    model = CQL("MlpPolicy", None, paths[0], **SMALL).learn(1)
+    model.set_env(normaliser(None))
+    assert model.get_vec_normalize_env().ret_rms.var == CQL("MlpPolicy", normaliser(None), paths[0], **SMALL).learn(
+        1
+    ).get_vec_normalize_env().ret_rms.var != 1  # fmt: skip
+
+    examples = np.full((4, 3), 5, np.float32)
+    for algorithm in (CEBORL, DCQL):
+        model = algorithm("MlpPolicy", normaliser(0), paths[0], examples, **SMALL).learn(1)
+        model.save(tmp_path / "model")
+        model.set_env(normaliser(5))
+        again = algorithm.load(tmp_path / "model", env=normaliser(5), examples=examples).learn(1)
+        np.testing.assert_array_equal(model.all_examples(), np.zeros((4, 3)))
+        np.testing.assert_array_equal(model.replay_buffer.rewards, again.replay_buffer.rewards)
+
+
+def test_a_buffer_of_sac_is_a_dataset(tmp_path):
+    env = ForbiddenEnv(STATES, allowed=True)
+    sac = SAC("MlpPolicy", env, buffer_size=50, learning_starts=100, policy_kwargs={"net_arch": [4]}).learn(20)
+    sac.save_replay_buffer(tmp_path / "sac")
+    model = CQL("MlpPolicy", env, **SMALL)
+    model.load_replay_buffer(tmp_path / "sac")
+    assert model.replay_buffer.size() > 10 and model.learn(1).num_timesteps == 1
+    with pytest.raises(DatasetError, match=r"sac: replay buffer: is a ReplayBuffer.*dataset=PATH"):
+        model.load_replay_buffer(tmp_path / "sac")
 
 
 def test_a_policy_of_normalised_observations_asks_for_its_environment(paths, tmp_path):

@@ -68,6 +68,10 @@ def test_sac_goes_on_with_the_rewards_that_the_critic_knows(files, tmp_path):  #
     export_sac(model, tmp_path / "sac", data_ratio=0.5, buffer_size=100)
     sac = SAC.load(tmp_path / "sac", env=ForbiddenEnv(STATES, allowed=True))
     assert set(np.unique(sac.replay_buffer.offline.rewards)) == {0, 1}
+    n_steps = model.replay_buffer.size()
+    for rewards, checksum in ((np.zeros(n_steps - 1), None), (np.zeros(n_steps), 1)):
+        with pytest.raises(DatasetError, match=r"rewards: are of other data.*export the model again"):
+            MixedReplayBuffer(20, STATES, ACTIONS, dataset=files["MlpPolicy"][0], rewards=rewards, checksum=checksum)
 
 
 def test_mixed_batches_follow_the_seed(files):  # noqa: F811

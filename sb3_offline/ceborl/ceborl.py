@@ -1,7 +1,6 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 import math
-import zlib
 from typing import Any, Literal
 
 import torch as th
@@ -220,7 +219,7 @@ class CEBORL(ExampleBasedAlgorithm):
 
     def _prepare_data(self) -> None:
         super()._prepare_data()
-        checksum = zlib.crc32(self.replay_buffer.actions.tobytes())
+        checksum = self.replay_buffer.checksum()
         # The numbers of kept transitions are of another dataset, or a loaded model is to keep more or fewer
         if (checksum, self.policy_batches) != (self._dataset_checksum, self._weighted_transitions.n_batches):
             self._weighted_transitions = WeightedTransitions(self.policy_batches)

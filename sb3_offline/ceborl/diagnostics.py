@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_offline.ceborl.ceborl import CEBORL
+from sb3_offline.common.callbacks import log_at_once
 
 SATURATED_CLASSIFIER, SATURATED_SHARE = 0.99, 0.5
 ON_BOUNDS, COLLAPSED_SHARE = 0.98, 0.5
@@ -82,8 +83,7 @@ class DiagnosticsCallback(BaseCallback):
     def _on_step(self) -> bool:
         if self.num_timesteps % self.check_freq == 0:
             found = self.measure()
-            for name, value in found.items():
-                self.logger.record(f"diagnostics/{name}", value)
+            log_at_once(self, {f"diagnostics/{name}": value for name, value in found.items()})
             self._judge(found)
         return True
 

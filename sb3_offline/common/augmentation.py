@@ -48,7 +48,9 @@ def _repeat_edges(images: th.Tensor, filled: slice, dim: int) -> None:
             images.narrow(dim, first, count).copy_(images.narrow(dim, line, 1))
 
 
-def shift_observations(observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator) -> PyTorchObs:
+def shift_observations(
+    observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator, float_images: bool = False
+) -> PyTorchObs:
     """
     Apply :func:`random_shift` to every image in a batch of observations; vectors pass unchanged.
 
@@ -56,8 +58,11 @@ def shift_observations(observations: PyTorchObs, space: spaces.Space, max_shift:
     :param space: channel-first space of one observation
     :param max_shift: largest shift in pixels
     :param rng: source of the offsets
+    :param float_images: whether arrays of three axes are images that are normalised already, whatever their dtype
     :return: the observations, shifted
     """
     if isinstance(space, spaces.Dict):
-        return {key: shift_observations(observations[key], space[key], max_shift, rng) for key in space}  # type: ignore
-    return random_shift(observations, max_shift, rng) if is_image_space(space) else observations  # type: ignore[arg-type]
+        parts = {key: (observations[key], space[key]) for key in space}  # type: ignore[index]
+        return {key: shift_observations(*part, max_shift, rng, float_images) for key, part in parts.items()}  # type: ignore
+    is_image = is_image_space(space, normalized_image=float_images)
+    return random_shift(observations, max_shift, rng) if is_image else observations  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ import sys
 import time
 import warnings
 from os import PathLike
+from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -112,7 +113,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.random_shift = random_shift
         self._sampler_state: dict[str, Any] | None = None
-        self._torch_rng_state: th.Tensor | None = None  # of a saved model, until it goes on learning
+        # Of a saved model, until it goes on learning
+        self._torch_rng_state: th.Tensor | None = None
+        self._cuda_rng_state: th.Tensor | None = None
         self._observations_normalized = False  # by a VecNormalize, when it learned
         self._metrics: dict[str, tuple[th.Tensor, int]] = {}
 
@@ -209,9 +212,20 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         if self._replay_buffer is not None:  # before it is taken
             self._check_normalizer(unwrap_vec_normalize(env))  # type: ignore[arg-type]
+        normalize, buffer = self._vec_normalize_env, self._replay_buffer
         super().set_env(env, force_reset)
-        if self._replay_buffer is not None:
-            self._fit_observation_statistics()
+        if buffer is None or self._vec_normalize_env is normalize:
+            return
+        # What was made with the other normaliser is made anew
+        rewards = buffer.rewards
+        buffer.restore_rewards()
+        try:
+            self._prepare_data()
+        except BaseException:
+            self._replay_buffer = None
+            raise
+        if not buffer.is_relabelled:
+            buffer.rewards = rewards  # of load_replay_buffer
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
@@ -226,11 +240,19 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         """
         Take from a saved buffer where it was in its data, if these are the model's own; and which data, if the model has none.
 
-        :param path: of the file that ``save_replay_buffer`` wrote
+        :param path: of the file that ``save_replay_buffer`` wrote. One of an online algorithm of SB3 is a dataset: a model
+            that has none takes it
         :param truncate_last_traj: see :class:`~stable_baselines3.common.off_policy_algorithm.OffPolicyAlgorithm`
         """
         super().load_replay_buffer(path, truncate_last_traj)
         saved, self.replay_buffer = self._replay_buffer, None
+        if not isinstance(saved, OfflineReplayBuffer):
+            if self.dataset is not None or not isinstance(path, str | PathLike):
+                problem = f"is a {type(saved).__name__}, in which this model has no place to go on from"
+                raise DatasetError(path, "replay buffer", problem, "Learn from it: dataset=PATH")
+            self.dataset = path if Path(path).suffix else f"{path}.pkl"
+            self._open_data()
+            return
         if self.dataset is None:
             self.dataset = saved.datasets
         own = self.replay_buffer
@@ -248,7 +270,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         :return: the batch with its images shifted
         """
         max_shift = self.random_shift if max_shift is None else max_shift
-        return shift_observations(observations, self.observation_space, max_shift, self.replay_buffer.rng)
+        images_are_floats = not self.policy.normalize_images
+        return shift_observations(observations, self.observation_space, max_shift, self.replay_buffer.rng, images_are_floats)
 
     # -------------------------------------------------------------- learning
 
@@ -315,7 +338,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._metrics = {}
         if self._torch_rng_state is not None:
             th.set_rng_state(self._torch_rng_state)
-            self._torch_rng_state = None
+            if self._cuda_rng_state is not None and self.device.type == "cuda":
+                th.cuda.set_rng_state(self._cuda_rng_state, self.device)
+            self._torch_rng_state = self._cuda_rng_state = None
         if not self._custom_logger:
             self._logger = utils.configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
         return total_timesteps, self._init_callback(callback, progress_bar)
@@ -362,10 +387,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         if self._replay_buffer is not None:
             self._sampler_state = self._replay_buffer.get_rng_state()
-        # With these two, a loaded model goes on (on the CPU) as this one would: actions are drawn by PyTorch's generator.
+        # With these, a loaded model goes on as this one would: actions are drawn by PyTorch's generator of the device.
         self._torch_rng_state = th.get_rng_state()
+        self._cuda_rng_state = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         super().save(path, exclude, include)
-        self._torch_rng_state = None
+        self._torch_rng_state = self._cuda_rng_state = None
 
     @classmethod
     def load(  # type: ignore[override]

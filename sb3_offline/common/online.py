@@ -76,7 +76,7 @@ def export_sac(
             raise DatasetError(buffer.datasets[0].path, "rewards", problem, remedy)
         sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
         if buffer.is_relabelled:  # SAC goes on with the rewards that the critic knows
-            sac.replay_buffer_kwargs["rewards"] = buffer.rewards
+            sac.replay_buffer_kwargs.update(rewards=buffer.rewards, checksum=buffer.checksum())
     sac.save(Path(path))
 
 

@@ -1,6 +1,7 @@
 """A replay buffer over datasets on disk."""
 
 import warnings
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -89,6 +90,8 @@ class OfflineReplayBuffer(ReplayBuffer):
         next_actions: bool = False,
         seed: int | None = None,
     ):
+        if n_steps < 1:
+            raise ValueError(f"n_steps is {n_steps}; windows have one step at least")
         datasets = open_datasets(dataset)
         n_steps_total = sum(d.n_steps for d in datasets)
         # Not ReplayBuffer's constructor: it would allocate arrays for the transitions that we hold otherwise
@@ -247,6 +250,10 @@ class OfflineReplayBuffer(ReplayBuffer):
         """Whether there are rewards: in the files, or others in their place."""
         return self.is_relabelled or self.datasets[0].rewards is not None
 
+    def restore_rewards(self) -> None:
+        """Take the rewards of the files again."""
+        self.rewards = self._file_rewards
+
     @property
     def is_relabelled(self) -> bool:
         """Whether the rewards are others than those of the files."""
@@ -327,6 +334,10 @@ class OfflineReplayBuffer(ReplayBuffer):
                 count = total
         return mean, squares / count, count
 
+    def checksum(self) -> int:
+        """:return: of all actions: it tells data apart that have as many steps"""
+        return zlib.crc32(self.actions.tobytes())
+
     def get_rng_state(self) -> dict[str, Any]:
         """:return: the generator's state, for an exact resume"""
         return dict(self.rng.bit_generator.state)
@@ -367,10 +378,15 @@ def _match_observations(dataset: OfflineDataset, space: spaces.Space) -> set[str
         raise DatasetError(dataset.path, "observation_space", problem, "Use the environment that the data were collected in")
     transposed = set()
     for name, part in wanted.items():
+        fits = True
         shape, learner = tuple(stored[name].shape or ()), tuple(part.shape or ())
         if len(shape) == 3 and shape != learner and (shape[2], shape[0], shape[1]) == learner:
             transposed.add(name)
-        elif shape != learner or np.dtype(stored[name].dtype).kind != np.dtype(part.dtype).kind:
+        elif isinstance(part, spaces.Box) and isinstance(stored[name], spaces.Box):
+            fits = shape == learner and np.dtype(stored[name].dtype).kind == np.dtype(part.dtype).kind
+        else:
+            fits = stored[name] == part  # the same numbers, not only as many columns
+        if not fits:
             problem = f"is {stored[name]}, but the learner has {part}"
             raise DatasetError(
                 dataset.path, name, problem, "Use the environment (and wrappers) that the data were collected in"

@@ -14,7 +14,13 @@ from sb3_offline.data.reader import DatasetSource
 
 class _Mixed:
     def __init__(
-        self, *args: Any, dataset: DatasetSource, data_ratio: float = 0.5, rewards: np.ndarray | None = None, **kwargs: Any
+        self,
+        *args: Any,
+        dataset: DatasetSource,
+        data_ratio: float = 0.5,
+        rewards: np.ndarray | None = None,
+        checksum: int | None = None,
+        **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
         if not 0 <= data_ratio <= 1:
@@ -25,6 +31,10 @@ class _Mixed:
             dataset, self.observation_space, self.action_space, self.device, seed=seed  # type: ignore[attr-defined]
         )
         if rewards is not None:
+            if len(rewards) != self.offline.size() or checksum not in (None, self.offline.checksum()):
+                problem = f"are of other data: {len(rewards)} rewards, and the dataset has {self.offline.size()} steps"
+                remedy = "Give the dataset that they were made for, or export the model again"
+                raise DatasetError(self.offline.datasets[0].path, "rewards", problem, remedy)
             self.offline.rewards = rewards
         if not self.offline.has_rewards:
             problem, remedy = "are missing, but a learner from rewards asks for them", "Give a dataset with rewards"
@@ -55,6 +65,8 @@ class MixedReplayBuffer(_Mixed, ReplayBuffer):
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these; with rewards, unless others are given
     :param data_ratio: share of each batch that comes from the dataset
     :param rewards: (steps,) float32, in place of the dataset's
+    :param checksum: of the data that ``rewards`` are of (:meth:`OfflineReplayBuffer.checksum
+        <sb3_offline.data.buffer.OfflineReplayBuffer.checksum>`); with other data ``DatasetError`` is raised
     :param kwargs: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
     """
 

@@ -54,6 +54,8 @@ def observation_stores(
     """
     names = list(subspaces(datasets[0].observation_space, "observations"))
     columns: dict[str, list[ArrayLike]] = {name: [dataset.arrays[name] for dataset in datasets] for name in names}
+    if storage not in ("auto", "memory", "mmap"):
+        raise ValueError(f"dataset_storage is {storage!r}; give 'auto', 'memory' or 'mmap'")
     if storage == "auto":
         size = sum(len(array) * _row_bytes(array) for column in columns.values() for array in column)
         storage = "mmap" if size > available_memory() / 2 else "memory"

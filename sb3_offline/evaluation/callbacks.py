@@ -6,10 +6,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.ceborl import CEBORL
 from sb3_offline.ceborl.losses import success_odds
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
+from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.example_based import ExampleSource
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.reward_based import RewardBasedAlgorithm
@@ -84,8 +86,7 @@ class OfflineEvalCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq == 0:
-            for name, value in self.evaluate().items():
-                self.logger.record(f"offline_eval/{name}", value)
+            log_at_once(self, {f"offline_eval/{name}": value for name, value in self.evaluate().items()})
         return True
 
     def evaluate(self) -> dict[str, float]:
@@ -103,7 +104,7 @@ class OfflineEvalCallback(BaseCallback):
         if isinstance(model, CEBORL | ORIL):
             found |= self._judge_classifier()
         if self.buffer.has_rewards:
-            found["data_return"] = float(discounted_returns(self.buffer, model.gamma).mean())
+            found["data_return"] = float(discounted_returns(self.buffer, model.gamma, model._vec_normalize_env).mean())
             if self.fqe_steps:
                 found["fqe_value"] = float(fitted_q_evaluation(model, self.buffer, self.fqe_steps).mean())
         return found
@@ -151,13 +152,14 @@ class OfflineEvalCallback(BaseCallback):
         return logits.sigmoid().float().cpu().numpy()
 
 
-def discounted_returns(buffer: OfflineReplayBuffer, gamma: float) -> np.ndarray:
+def discounted_returns(buffer: OfflineReplayBuffer, gamma: float, env: VecNormalize | None = None) -> np.ndarray:
     """
     :param buffer: with rewards
     :param gamma: the discount factor
+    :param env: normalises rewards
     :return: (E,) the discounted returns of its episodes
     """
     starts = first_steps(buffer)
     lengths = np.diff(np.append(starts, buffer.size()))
     discounts = gamma ** (np.arange(buffer.size()) - np.repeat(starts, lengths))
-    return np.add.reduceat(buffer.rewards * discounts, starts)
+    return np.add.reduceat(buffer._normalize_reward(buffer.rewards, env) * discounts, starts)

@@ -52,7 +52,7 @@ def fitted_q_evaluation(
     env, policy = model._vec_normalize_env, model.policy
     policy.set_training_mode(False)
     rng = np.random.default_rng(seed)
-    with th.random.fork_rng(devices=[]):
+    with th.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         th.manual_seed(seed)
         critic, target = new_critic(policy), new_critic(policy)  # type: ignore[arg-type]
         target.load_state_dict(critic.state_dict())
