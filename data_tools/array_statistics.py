@@ -47,6 +47,8 @@ def _of_images(array: JoinedRows) -> ArrayStatistics:
 
 def _of_rows(array: JoinedRows) -> ArrayStatistics:
     columns = int(np.prod(array.shape[1:]))
+    if array.dtype.kind not in "biuf":  # text
+        return ArrayStatistics(array, np.full(1, np.inf), np.full(1, -np.inf), 0)
     low, high, n_bad = np.full(columns, np.inf), np.full(columns, -np.inf), 0
     rows = max(READ_BYTES // max(columns * array.dtype.itemsize, 1), 1)
     for first in range(0, len(array), rows):

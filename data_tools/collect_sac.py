@@ -126,6 +126,9 @@ def collect_shard(
     :return: the path of the shard; raises ``DatasetError`` where a file of something else is in the way, or is being written
     """
     check_tasks(collection.tasks)
+    if n_shards > collection.episodes_per_task:
+        problem = f"are {n_shards}, but a task has {collection.episodes_per_task} episodes"
+        raise DatasetError(path, "shards", problem, "Make fewer shards, or collect more episodes")
     path = shard_path(path, shard, n_shards)
     bounds = [collection.episodes_per_task * i // n_shards for i in (shard, shard + 1)]
     jobs = [_Job(task, number) for number in range(*bounds) for task in collection.tasks]

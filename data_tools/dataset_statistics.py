@@ -1,6 +1,7 @@
 """Numbers that describe a dataset: what the terminal's summary and the page of ``sb3-offline inspect`` both show."""
 
 import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ def inspect_dataset(
     arrays = array_statistics(data)
     summary: dict[str, Any] = {
         "files": [
-            {"file": str(part.path), "bytes": os.path.getsize(part.path), "storage": part.storage, "episodes": part.n_episodes}
+            {"file": str(part.path), "bytes": _size(part.path), "storage": part.storage, "episodes": part.n_episodes}
             for part in data.parts
         ],
         "env_id": data.env_id,
@@ -62,6 +63,11 @@ def inspect_dataset(
         warnings += more
     summary["warnings"] = [warning._asdict() for warning in warnings]
     return summary
+
+
+def _size(path: Path) -> int:
+    """:return: bytes of a file, or of all files in a folder"""
+    return sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
 
 
 def _spread(values: np.ndarray) -> dict[str, float]:

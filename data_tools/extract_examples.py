@@ -10,7 +10,7 @@ from gymnasium import spaces
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import Observations, save_examples
 from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
-from sb3_offline.data.selection import of_source
+from sb3_offline.data.selection import check_source, of_source
 
 
 def extract_examples(
@@ -28,6 +28,8 @@ def extract_examples(
     :return: ``(n, *shape)`` observations, or a dict of such for a Dict space, in the dataset's layout; and their provenance
     """
     datasets = open_datasets(dataset)
+    if source is not None:
+        check_source(datasets, source)
     steps_of = [_success_steps(part, source) for part in datasets]
     counts = [len(steps) for steps in steps_of]
     if sum(counts) < n:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,7 @@ def load_actor(path: str | os.PathLike[str]) -> SacActor:
     try:
         with np.load(path) as weights:
             return SacActor(dict(weights))
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(
             path, "weights", f"cannot be read ({error})", "Name a file written by sb3-offline train-sac"
         ) from error
@@ -116,7 +117,7 @@ def load_policies(folder: str | os.PathLike[str]) -> dict[str, list[Checkpoint]]
     remedy = "Name a folder written by sb3-offline export-sac"
     try:
         tasks = json.loads(path.read_text())["tasks"]
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(path, "file", f"cannot be read ({error})", remedy) from error
     policies = {}
     for task, entry in tasks.items():

@@ -16,7 +16,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         arguments = _parser(argv[:1]).parse_args(argv)
         arguments.run(arguments)
-    except (RuntimeError, ValueError, FileExistsError) as error:
+    except (RuntimeError, ValueError, OSError) as error:
         sys.exit(f"sb3-offline: {error}")
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])

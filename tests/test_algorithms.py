@@ -163,9 +163,11 @@ def test_shipped_configs_fit_their_algorithm(algo, files):
         create_model(algo, config, dataset, examples if needs_examples(algo) else None)
 
 
-@pytest.mark.parametrize(("text", "at_the_end"), [("lin_1e-2", 0.0), ("1e-2", 1e-2)])  # YAML takes 1e-2 for text
-def test_a_config_may_let_the_learning_rate_fall(text, at_the_end, files):
-    config = {"policy": "MlpPolicy", "learning_rate": text, "batch_size": 4}
+@pytest.mark.parametrize(("text", "at_the_end"), [("lin_1e-2", 0.0), ("1e-2", 1e-2)])  # PyYAML takes 1e-2 for text
+def test_a_config_may_let_the_learning_rate_fall(text, at_the_end, files, tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(f"default: {{policy: MlpPolicy, n_timesteps: 1, batch_size: 4, learning_rate: {text}}}")
+    config = load_config(str(path), "any")
     model = create_model("bc", config, files["MlpPolicy"][0])
     assert model.actor.optimizer.param_groups[0]["lr"] == 1e-2
     assert model.learn(10).actor.optimizer.param_groups[0]["lr"] == pytest.approx(at_the_end, abs=2e-3)

@@ -14,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_offline import BC
 from sb3_offline.cli import main
 from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
@@ -65,6 +66,11 @@ def test_to_minari_and_back(minari, tmp_path, space, options):
         np.testing.assert_array_equal(theirs[1].observations, make_episode(1, space)["observations"])
     main(["convert", "minari:test/there-v0", str(tmp_path / "back.h5"), "--storage", "compressed"])
     assert_same(OfflineDataset(tmp_path / "d.h5"), OfflineDataset(tmp_path / "back.h5"))
+    if not options:
+        dataset = OfflineDataset(tmp_path / "d.h5")
+        dataset.header.env_id = "Pendulum-v1"  # as --env does where a source declares none
+        convert(dataset, "minari:test/named-v0")
+        assert OfflineDataset("minari:test/named-v0").env_id == "Pendulum-v1"
 
 
 def test_from_minari_and_back(minari, tmp_path):

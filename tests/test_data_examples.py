@@ -108,6 +108,11 @@ def test_unfit_files(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"zip?")
     fails(tmp_path / "a.npz", "cannot be read")
     np.savez(tmp_path / "b.npz", a=FRAMES, b=FRAMES)
+    for name, content in {"cut": (tmp_path / "b.npz").read_bytes()[:-40], "empty": b""}.items():
+        (tmp_path / f"{name}.npz").write_bytes(content)
+        fails(tmp_path / f"{name}.npz", "cannot be read")
+    np.savez(tmp_path / "objects.npz", np.array([None]))
+    fails(tmp_path / "objects.npz", "cannot be read")
     fails(tmp_path / "b.npz", "holds the arrays .*'a', 'b'.*Rename")
     write_dataset(tmp_path / "d.h5")
     fails(tmp_path / "d.h5", "is 'sb3-offline-dataset' version 1, expected 'sb3-offline-examples'.*Extract")
@@ -134,7 +139,7 @@ def test_extracted_are_observations_after_successful_steps(tmp_path, space):
     assert all(episode % 2 for episode in provenance["datasets"][0]["episodes"])
     with pytest.raises(DatasetError, match=rf"success: holds {len(wanted)} steps with success of source 'left'"):
         extract_examples(pattern, len(wanted) + 1, source="left")
-    with pytest.raises(DatasetError, match=r"source: has no 'up'. Its sources are"):
+    with pytest.raises(DatasetError, match=r"source: has no 'up'. The sources are"):
         extract_examples(pattern, 1, source="up")
 
 

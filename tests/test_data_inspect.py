@@ -177,7 +177,7 @@ def test_examples_are_held_against_the_data(tmp_path, capsys):
         inspect_dataset(tmp_path / "a.h5", np.zeros((2, 5)))
 
 
-@pytest.mark.parametrize("kind", ["states", "unlabelled", "d4rl", "empty", "one"])
+@pytest.mark.parametrize("kind", ["states", "unlabelled", "d4rl", "empty", "one", "text"])
 def test_any_dataset_has_a_page(tmp_path, kind):
     path, rng = tmp_path / "a.h5", np.random.default_rng(0)
     if kind == "d4rl":
@@ -189,7 +189,11 @@ def test_any_dataset_has_a_page(tmp_path, kind):
         with DatasetWriter(path, space, spaces.Discrete(3), rewards=False, success=False) as writer:
             writer.add_episode(rng.random((11, 4, 84, 200)), rng.integers(0, 3, 10))
     else:
-        write_dataset(path, {"states": 9, "empty": 0, "one": 1}[kind], IMAGES if kind == "one" else STATES)
+        write_dataset(path, {"states": 9, "empty": 0, "one": 1, "text": 0}[kind], IMAGES if kind == "one" else STATES)
+    if kind == "text":
+        with DatasetWriter(path, STATES, ACTIONS, mode="w", extras={"note": ((), "S4")}) as writer:
+            episode = {**make_episode(0, STATES, 5), "extras": {"note": np.array([b"a", b"b", b"", b"", b""])}}
+            writer.add_episode(**{key: value for key, value in episode.items() if key != "source"})
     examples = []
     if kind == "one":  # no other episode says what is near
         np.save(tmp_path / "e.npy", OfflineDataset(path).observations[:1])

@@ -183,6 +183,8 @@ def test_d4rl_file_without_next_observations(tmp_path):
     [
         ({"actions": np.full((10, 1), 2.0)}, r"actions: reaches from 2 to 2, .*action_space"),
         ({"rewards": np.zeros(9)}, "rewards: has 9 rows, but actions has 10"),
+        ({"rewards": np.zeros((10, 2))}, r"rewards: has shape \(10, 2\), expected \(10,\)"),
+        ({"next_observations": np.zeros((10, 3))}, r"next_observations: has shape \(10, 3\), expected \(10, 2\)"),
         ({"observations": np.full((10, 2), np.nan)}, "observations: holds NaN or infinity"),
     ],
 )

@@ -42,6 +42,8 @@ def test_files_without_a_wanted_episode_are_left_out(tmp_path):
         write_dataset(tmp_path / f"{first}.h5", 1, first=first)  # "right", "left"
     (only,) = select_episodes(str(tmp_path / "*.h5"), source="left")
     assert only.path.name == "1.h5"
+    write_dataset(tmp_path / "2.h5", 1, sources=["right"])  # one file a source
+    assert [part.path.name for part in select_episodes(str(tmp_path / "*.h5"), source="right")] == ["0.h5", "2.h5"]
 
 
 def test_what_cannot_be_chosen_is_named(tmp_path):

@@ -1,6 +1,7 @@
 """The command line on real, small data: what the README promises, in seconds instead of minutes."""
 
 import csv
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -112,6 +113,8 @@ def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "broken.yml"], "broken.yml: is not YAML"),
         (["train", "--dataset", "x.h5", "-o", "run", "--env", "No-v0", "--eval-freq", "1"], "no environment 'No-v0'"),
         (["collect", "out.h5", "--tasks", "door-shut"], "door-shut"),
+        (["collect", "short.yml/out.h5"], "short.yml"),
+        (["collect-sac", "out.h5", "--episodes-per-task", "1", "--shard", "0/2"], "shards: are 2.*1 episodes"),
     ],
 )
 def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
@@ -182,6 +185,33 @@ class Still:
             self.starts.append(observation.flatten())
         self.n += 1
         return self.action, None
+
+
+class Grey(gym.Env):
+    """Draws pictures of its own size, and knows no other."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, True, False, {}
+
+    def render(self):
+        return np.full((20, 30, 3), 128, np.uint8)
+
+
+def test_any_environment_that_draws_pictures_is_recorded(tmp_path):
+    gym.register("Grey-v0", Grey)
+    assert record_gif(Still(1), "Grey-v0", {}, tmp_path / "grey.gif", n_episodes=2) == [False, False]
+    with Image.open(tmp_path / "grey.gif") as picture:
+        assert picture.size == (30, 20)
 
 
 def test_recorded_episodes_are_those_of_the_evaluation(tmp_path):

@@ -45,6 +45,9 @@ def read_d4rl(
         if len(array) != n:
             problem = f"has {len(array)} rows, but actions has {n}"
             raise DatasetError(path, name, problem, "All arrays of a D4RL-style file have one row per step")
+        shape = raw["observations"].shape if name == "next_observations" else (n,)
+        if name not in ("observations", "actions") and array.size != np.prod(shape):
+            raise DatasetError(path, name, f"has shape {array.shape}, expected {shape}", "Check how the file was written")
     if n == 0:
         raise DatasetError(path, "actions", "holds no step", "Check how the file was written")
     header = Header(

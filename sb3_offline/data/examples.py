@@ -2,6 +2,7 @@
 
 import json
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -108,14 +109,12 @@ def _read_hdf5(path: Path) -> Observations:
 def _read_numpy(path: Path, space: spaces.Space) -> Observations:
     try:
         loaded = np.load(path, allow_pickle=False)
+        arrays = loaded if isinstance(loaded, np.ndarray) else dict(loaded)
     except FileNotFoundError as error:
         raise DatasetError(path, "file", "does not exist", "Check the path") from error
-    except (OSError, ValueError) as error:  # not NumPy's format, cut off, or pickled objects
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:  # not NumPy's format, cut off, or pickled objects
         raise DatasetError(path, "file", f"cannot be read ({error})", "Save plain arrays with numpy.savez") from error
-    if isinstance(loaded, np.ndarray):
-        return loaded
-    arrays = dict(loaded)
-    if isinstance(space, spaces.Dict):
+    if isinstance(arrays, np.ndarray) or isinstance(space, spaces.Dict):
         return arrays
     if "observations" not in arrays and len(arrays) != 1:
         problem = f"holds the arrays {sorted(arrays)}, none of them called 'observations'"

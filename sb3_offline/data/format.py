@@ -82,6 +82,8 @@ class Header:
         fields = {f"episodes/{name}": Field("episode", (), np.dtype(dtype)) for name, dtype in episode_dtypes.items()}
         for name, space in subspaces(self.observation_space, "observations").items():
             fields[name] = Field("observation", tuple(space.shape or ()), np.dtype(space.dtype))
+        if isinstance(self.action_space, spaces.Dict):
+            raise DatasetError("", "action_space", "is a Dict", "Flatten the actions (gymnasium.ActionWrapper)")
         action_dtype = np.float32 if isinstance(self.action_space, spaces.Box) else self.action_space.dtype
         fields["actions"] = Field("step", tuple(self.action_space.shape or ()), np.dtype(action_dtype))
         if self.rewards:

@@ -74,7 +74,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             raw = {name: file[name] for name in (*REQUIRED, "rews") if name in file.files}
     except FileNotFoundError as error:
         raise DatasetError(path, "file", "does not exist", "Check the path") from error
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(path, "file", f"cannot be read ({error})", "Write the rollouts again with imitation") from error
     for name in REQUIRED:
         if name not in raw:

@@ -208,16 +208,17 @@ def write_minari(dataset: "OfflineDataset", destination: str) -> None:
     for name in ("author", "author_email"):
         if name in metadata:
             metadata[name] = set(metadata[name])
-    if "env_spec" not in metadata and dataset.env_id in gym.registry:
-        spec = gym.spec(dataset.env_id)
-        spec.kwargs.update(dataset.env_kwargs)
+    header = dataset.header
+    if "env_spec" not in metadata and header.env_id in gym.registry:
+        spec = gym.spec(header.env_id)
+        spec.kwargs.update(header.env_kwargs)
         metadata["env_spec"] = spec.to_json()
     metadata["sb3_offline"] = {
-        "env_id": dataset.env_id,
-        "env_kwargs": dataset.env_kwargs,
+        "env_id": header.env_id,
+        "env_kwargs": header.env_kwargs,
         "provenance": {name: value for name, value in dataset.provenance.items() if name != "minari"},
-        "sources": dataset.header.sources,
-        "rewards": dataset.header.rewards,
+        "sources": header.sources,
+        "rewards": header.rewards,
     }
     try:
         with warnings.catch_warnings():

@@ -1,5 +1,7 @@
 """Episodes of datasets chosen by their labels: what was attempted (``source``), and whether it succeeded (``success``)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sb3_offline.data.errors import DatasetError
@@ -17,13 +19,15 @@ def select_episodes(dataset: DatasetSource, *, source: str | None = None, succes
         no such label
     """
     chosen, datasets = [], open_datasets(dataset)
+    if source is not None:
+        check_source(datasets, source)
     for part in datasets:
         wanted = np.ones(part.n_episodes, dtype=bool) if source is None else of_source(part, source)
         if success is not None:
             if part.success is None:
                 remedy = "Take all episodes, or collect data with success labels"
                 raise DatasetError(part.path, "success", "is missing: the file has no success labels", remedy)
-            wanted &= np.logical_or.reduceat(part.success, part.step_starts) == success
+            wanted = wanted & np.logical_or.reduceat(part.success, part.step_starts) == success
         if wanted.any():
             chosen.append(part.select(np.flatnonzero(wanted)))
     if not chosen:
@@ -32,12 +36,20 @@ def select_episodes(dataset: DatasetSource, *, source: str | None = None, succes
     return chosen
 
 
+def check_source(datasets: Sequence[OfflineDataset], source: str) -> None:
+    """Raise ``DatasetError`` where a dataset has no labels of its episodes' sources, or none of them knows this one."""
+    known = list(dict.fromkeys(name for dataset in datasets for name in dataset.sources))
+    for dataset in datasets:
+        if dataset.source is None or source not in known:
+            raise DatasetError(dataset.path, "source", f"has no {source!r}", f"The sources are {known}")
+
+
 def of_source(dataset: OfflineDataset, source: str) -> np.ndarray:
     """
     :param dataset: with labels of its episodes' sources
-    :param source: one of them
+    :param source: one of them, or of another dataset's
     :return: (E,) bool, which episodes are of this source
     """
-    if source not in dataset.sources or dataset.source is None:
-        raise DatasetError(dataset.path, "source", f"has no {source!r}", f"Its sources are {dataset.sources}")
+    if dataset.source is None or source not in dataset.sources:
+        return np.zeros(dataset.n_episodes, dtype=bool)
     return dataset.source == dataset.sources.index(source)

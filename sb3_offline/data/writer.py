@@ -224,7 +224,7 @@ class DatasetWriter:
         lock_file(self._file, self.path)
 
     def _read_places(self, file: h5py.File) -> None:
-        self._offsets = {name: file[name].id.get_offset() for name in [*self._fields, "n_episodes"]}
+        self._offsets = {name: file[name].id.get_offset() or 0 for name in [*self._fields, "n_episodes"]}
         self._capacity = (len(file["episodes/length"]), len(file["actions"]))
 
     def _adopt(self) -> None:

@@ -1,12 +1,20 @@
 """Hyperparameters from YAML files in the form of the RL Zoo: a section per environment id."""
 
 import ast
+import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+
+class _Loader(yaml.SafeLoader):
+    """Takes 3e-4 for a number, as YAML 1.2 and Python do, and not for text."""
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789"))
 
 
 def config_path(name: str) -> Path:
@@ -32,7 +40,7 @@ def read_yaml(name: str, kind: str, folder: str = "") -> tuple[Path, Any]:
         shipped = sorted(file.stem for file in config_path(f"{folder}any").parent.glob("*.yml"))
         raise RuntimeError(f"{path}: there is no such {kind}; give a path, or one of {', '.join(shipped)}")
     try:
-        return path, yaml.safe_load(path.read_text())
+        return path, yaml.load(path.read_text(), _Loader)
     except yaml.YAMLError as error:
         raise RuntimeError(f"{path}: is not YAML ({error})") from error
 

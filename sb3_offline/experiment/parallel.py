@@ -48,7 +48,7 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
     """
     if not runs:
         return
-    context = multiprocessing.get_context("spawn")
+    context, others = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
     reports = context.Manager().Queue()
     bars: dict[str, tqdm] = {}
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
@@ -63,7 +63,7 @@ def train_in_parallel(runs: Mapping[str, dict[str, Any]], n_workers: int) -> Non
                     future.result()  # raises what went wrong in there, without waiting for the others
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
+            for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
             raise
     for bar in bars.values():

@@ -52,7 +52,7 @@ def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
             arrays = {name: file[name] for name in file.files}
         config = json.loads(str(arrays.pop(_DESCRIPTION)))
         spaces = [space_from_json(config.pop(name)) for name in ("observation_space", "action_space")]
-    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise RuntimeError(f"{path}: is not a policy of sb3-offline benchmark --policies ({error})") from error
     kwargs = {key: config[key] for key in ("policy", "policy_kwargs") if key in config}
     model = create_model(config["algo"], kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))

@@ -29,10 +29,24 @@ def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None
         observation, _, terminated, truncated, info = env.step(action)
         frames.append(env.render())
         done = terminated or truncated
-        solved_for += bool(info["is_success"])
+        solved_for += bool(info.get("is_success"))
         if solved_for == 1 and solved_at is None:
             solved_at = len(frames) - 1
     return frames, solved_at  # type: ignore[return-value]
+
+
+def make_recording_env(env_id: str, env_kwargs: dict[str, Any], size: int) -> gym.Env:
+    """
+    :param env_id: registered id
+    :param env_kwargs: of the environment
+    :param size: width and height of its pictures, where it can be told
+    :return: the environment, which draws pictures
+    """
+    arguments = {**env_kwargs, "render_mode": "rgb_array"}
+    try:
+        return gym.make(env_id, **{"width": size, "height": size, **arguments})
+    except TypeError:  # it takes no size
+        return gym.make(env_id, **arguments)
 
 
 def record_gif(
@@ -57,7 +71,7 @@ def record_gif(
     :param size: width and height in pixels
     :return: which of them were solved
     """
-    env = gym.make(env_id, render_mode="rgb_array", width=size, height=size, **env_kwargs)
+    env = make_recording_env(env_id, env_kwargs, size)
     pictures, durations, outcomes = [], [], []
     for index in range(n_episodes):
         frames, solved_at = record_episode(model, env, seed if index == 0 else None)

@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_offline
 from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
+from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
 from sb3_offline.experiment.data import resolve_data
@@ -95,7 +96,7 @@ class EvaluationTable(BaseCallback):
             result = evaluate_success(self.model, self.env_id, self.env_kwargs, self.n_episodes, seed)
             values = map(str, evaluation_row(self.num_timesteps, result))
             self._write([*rows, dict(zip(EVALUATION_FIELDS, values, strict=True))])
-            self.logger.record("eval/success_rate", result.success_rate)
+            log_at_once(self, {"eval/success_rate": result.success_rate})
             if self.verbose:
                 print(f"step {self.num_timesteps}: {sum(result.successes)} of {self.n_episodes} episodes solved")
         return True
@@ -189,20 +190,23 @@ def create_model(
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
     arguments = {**arguments, "env": None, **_data_arguments(config, dataset, examples), "seed": seed, **kwargs}
     if isinstance(arguments.get("learning_rate"), str):
-        arguments["learning_rate"] = _learning_rate(arguments["learning_rate"])
+        arguments["learning_rate"] = _schedule(arguments["learning_rate"])
     try:
         return find_algorithm(algo)(**arguments)
-    except TypeError as error:
+    except (TypeError, AssertionError) as error:  # SB3 asserts that a policy fits its spaces
         raise RuntimeError(f"{algo}: {error}; check the config, --hyperparams, --dataset and --examples") from error
 
 
-def _learning_rate(text: str) -> float | LinearSchedule:
-    """:return: what "lin_3e-4" means to the RL Zoo: a rate that falls to 0; or, without its prefix, the number"""
+def _schedule(text: str) -> LinearSchedule:
+    """:return: what "lin_3e-4" means to the RL Zoo: a rate that falls to 0"""
+    kind, _, number = text.partition("_")
     try:
-        value = float(text.removeprefix("lin_"))
+        value = float(number)
     except ValueError:
-        raise RuntimeError(f"learning_rate is {text!r}; give a number, or lin_NUMBER for one that falls to 0") from None
-    return LinearSchedule(value, 0.0, 1.0) if text.startswith("lin_") else value
+        value, kind = 0.0, ""
+    if kind != "lin":
+        raise RuntimeError(f"learning_rate is {text!r}; give a number, or lin_NUMBER for one that falls to 0")
+    return LinearSchedule(value, 0.0, 1.0)
 
 
 def _data_arguments(config: dict[str, Any], dataset: Any, examples: Any) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 
@@ -13,7 +12,7 @@ from sb3_offline.benchmark.grid import cell_folder, evaluation_seed
 from sb3_offline.ceborl import CEBORL
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
-from sb3_offline.experiment.recording import record_episode
+from sb3_offline.experiment.recording import make_recording_env, record_episode
 from sb3_offline.experiment.training import load_run
 from sb3_offline.report.results import Results
 
@@ -82,7 +81,7 @@ def play(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any], seed:
     :param seed: of the episode
     :return: what came of it
     """
-    env = gym.make(env_id, render_mode="rgb_array", width=PICTURE_SIZE, height=PICTURE_SIZE, **env_kwargs)
+    env = make_recording_env(env_id, env_kwargs, PICTURE_SIZE)
     watched = _Watched(model)
     try:
         frames, solved_at = record_episode(watched, env, seed)
