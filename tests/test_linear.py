@@ -41,7 +41,7 @@ def test_layers(dtype, rows):
     layers = layers.double() if dtype == th.float64 else layers
     x = x.to(dtype).requires_grad_()
     actual = run_layers(list(layers), x)
-    assert actual.dtype == dtype and distance(actual, expected) < TOLERANCE[dtype]
+    assert actual.dtype == layers[-1].weight.dtype and distance(actual, expected) < TOLERANCE[dtype]
     actual.double().pow(2).mean().backward()
     assert distance(gradients(layers), gradients(plain)) < 2 * TOLERANCE[dtype]
     assert distance(x.grad, plain_x.grad) < 2 * TOLERANCE[dtype]
@@ -72,6 +72,19 @@ def test_values_of_many_actions(mixed_precision, layer_norm):
     th.logsumexp(values, dim=2).mean().backward()
     th.logsumexp(expected, dim=2).mean().backward()
     assert distance(gradients(critic), gradients(plain)) < 2 * tolerance
+
+
+@pytest.mark.parametrize("n_actions", [None, 5])
+def test_large_values_keep_their_differences(n_actions):
+    kwargs = {"mixed_precision": True, "critic_output_bias": -1000.0, "critic_state_value": True}
+    critic = MlpPolicy(spaces.Box(-1, 1, (9,), np.float32), ACTIONS, lambda _: 1e-3, **kwargs).critic
+    observations, actions = th.randn(32, 9), th.rand(*((32, n_actions, 4) if n_actions else (32, 4))) * 2 - 1
+    features = critic.encode(observations)
+    assert features.dtype == th.bfloat16
+    rough = [critic.values(features, actions), critic.state_values(features)]
+    exact = [critic.values(features.float(), actions), critic.state_values(features.float())]
+    for values, expected in zip(rough, exact, strict=True):
+        assert distance(values + 1000, expected + 1000) < TOLERANCE[th.bfloat16]
 
 
 @pytest.mark.parametrize("mixed_precision", [False, True])

@@ -36,9 +36,9 @@ def _signed(tensor: th.Tensor) -> th.Tensor:
 
 
 def _forward(
-    x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]
+    x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None], exact: bool
 ) -> tuple[list[th.Tensor], list[th.Tensor]]:
-    """:return: weights in the dtype of ``x``; and ``x`` with the outputs of all layers"""
+    """:return: weights in the dtype of ``x``; and ``x`` with the outputs of all layers, the last one's exact if so"""
     # Outputs lie in memory with their features first, (out_features, rows). So all three products, forward and backward, find
     # the long axis of both sides contiguous: transposing thousands of rows takes as long as multiplying them.
     weights, inputs = [], [x]
@@ -46,9 +46,12 @@ def _forward(
         assert weight is not None
         # A first layer's weights may be columns of a wider matrix: oneDNN is a thousand times slower where rows have gaps.
         weights.append(weight.to(x.dtype).contiguous())
-        output = _product(weights[-1], inputs[-1]).t()
+        if exact and len(weights) == len(relus):
+            output = _product(weight, inputs[-1].to(weight.dtype)).t()
+        else:
+            output = _product(weights[-1], inputs[-1]).t()
         if bias is not None:
-            output.view(-1, *bias.shape).add_(bias.to(x.dtype))
+            output.view(-1, *bias.shape).add_(bias.to(output.dtype))
         if relu:
             _signed(output).clamp_min_(0)
         inputs.append(output)
@@ -59,8 +62,8 @@ class _Layers(th.autograd.Function):
     # All layers are one node of the graph: with a few hundred rows, PyTorch's work around a node takes as long as the node's.
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, relus: Sequence[bool], *parameters: th.Tensor | None) -> th.Tensor:
-        weights, inputs = _forward(x, relus, parameters)
+    def forward(ctx: Any, x: th.Tensor, relus: Sequence[bool], exact: bool, *parameters: th.Tensor | None) -> th.Tensor:
+        weights, inputs = _forward(x, relus, parameters, exact)
         ctx.relus = relus
         ctx.shapes = [() if parameter is None else parameter.shape for parameter in parameters]
         ctx.dtypes = [None if parameter is None else parameter.dtype for parameter in parameters]
@@ -72,6 +75,7 @@ class _Layers(th.autograd.Function):
         n_layers = len(ctx.relus)
         weights, inputs = ctx.saved_tensors[:n_layers], ctx.saved_tensors[n_layers:]
         gradients: list[th.Tensor | None] = [None] * len(ctx.needs_input_grad)
+        gradient = gradient.to(weights[-1].dtype)  # it has no offset, so three digits are enough
         for layer in reversed(range(n_layers)):
             if ctx.relus[layer]:
                 # Into the output, which no one reads any more: fresh memory would cost more than the operation.
@@ -79,7 +83,7 @@ class _Layers(th.autograd.Function):
                 th.ops.aten.threshold_backward.grad_input(_signed(gradient), output, 0, grad_input=output)
                 gradient = inputs[layer + 1]
             by_feature = gradient.t().contiguous()
-            of_weight, of_bias = 2 + 2 * layer, 3 + 2 * layer
+            of_weight, of_bias = 3 + 2 * layer, 4 + 2 * layer
             if ctx.needs_input_grad[of_bias]:
                 shape, dtype = ctx.shapes[2 * layer + 1], ctx.dtypes[2 * layer + 1]
                 rows = shape[0] if len(shape) == 2 else 1
@@ -109,10 +113,10 @@ def has_fast_bfloat16(device: th.device) -> bool:
     return device.type == "cpu" and any(check() for check in checks if check is not None)
 
 
-def _run(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None]) -> th.Tensor:
+def _run(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None], exact: bool = False) -> th.Tensor:
     if th.is_grad_enabled():
-        return _Layers.apply(x, relus, *parameters)  # type: ignore[no-untyped-call]
-    return _forward(x, relus, parameters)[1][-1]
+        return _Layers.apply(x, relus, exact, *parameters)  # type: ignore[no-untyped-call]
+    return _forward(x, relus, parameters, exact)[1][-1]
 
 
 def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
@@ -129,11 +133,12 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th
 
 def run_layers(layers: Sequence[nn.Module | tuple[th.Tensor, th.Tensor | None]], x: th.Tensor) -> th.Tensor:
     """
-    What ``nn.Sequential(*layers)`` does.
+    What ``nn.Sequential(*layers)`` does. A product at the end, without a ReLU, is in the dtype of its weights: around 1000
+    bfloat16 has steps of 4 and 8, and the values of two actions differ by less.
 
     :param layers: linear layers, as modules or as weight and bias as :func:`linear` takes them, and whatever stands between
     :param x: ``(rows, in_features)``; its dtype is that of the products
-    :return: ``(rows, out_features)``
+    :return: ``(rows, out_features)``; of the weights' dtype where a linear layer is the last one
     """
     relus: list[bool] = []
     parameters: list[th.Tensor | None] = []
@@ -147,4 +152,4 @@ def run_layers(layers: Sequence[nn.Module | tuple[th.Tensor, th.Tensor | None]],
             if relus:
                 x, relus, parameters = _run(x, relus, parameters), [], []
             x = layer(x.to(layer.weight.dtype)).to(x.dtype) if isinstance(layer, nn.LayerNorm) else layer(x)
-    return _run(x, relus, parameters) if relus else x
+    return _run(x, relus, parameters, exact=not relus[-1]) if relus else x
