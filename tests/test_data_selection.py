@@ -37,6 +37,13 @@ def test_chosen_episodes_are_the_files_own(storage, tmp_path):
             assert again.seeds[e] == episode["seed"] and again.lengths[e] == n
 
 
+def test_failures_of_one_source_are_failures_of_that_source(tmp_path):
+    episodes = write_dataset(tmp_path / "d.h5", 40)
+    (dataset,) = select_episodes(tmp_path / "d.h5", source="left", success=False)
+    wanted = [episode["seed"] for episode in episodes if episode["source"] == "left" and not solved(episode)]
+    assert len(wanted) > 0 and dataset.seeds.tolist() == wanted
+
+
 def test_files_without_a_wanted_episode_are_left_out(tmp_path):
     for first in (0, 1):
         write_dataset(tmp_path / f"{first}.h5", 1, first=first)  # "right", "left"

@@ -27,7 +27,7 @@ def select_episodes(dataset: DatasetSource, *, source: str | None = None, succes
             if part.success is None:
                 remedy = "Take all episodes, or collect data with success labels"
                 raise DatasetError(part.path, "success", "is missing: the file has no success labels", remedy)
-            wanted = wanted & np.logical_or.reduceat(part.success, part.step_starts) == success
+            wanted &= np.logical_or.reduceat(part.success, part.step_starts) == success
         if wanted.any():
             chosen.append(part.select(np.flatnonzero(wanted)))
     if not chosen:
