@@ -68,14 +68,11 @@ class DCQL(ExampleBasedAlgorithm, CQL):
         return (*super()._data_sources(), self.examples)
 
     def relabel(self, buffer: OfflineReplayBuffer) -> None:
-        normalize = self._vec_normalize_env
-        is_normalized = normalize is not None and normalize.norm_obs
-        vectors = ObservationVectors(
-            self.observation_space, None if is_normalized else self.replay_buffer.observation_statistics
-        )
+        statistics = None if self._observations_normalized else self.replay_buffer.observation_statistics
+        vectors = ObservationVectors(self.observation_space, statistics)
         goals = vectors(self.all_examples())
 
         def reward(batch: OfflineSamples) -> th.Tensor:
             return -self.reward_scale * mean_distance(vectors(batch.observations), goals, self.distance)
 
-        buffer.relabel(reward, normalize)
+        buffer.relabel(reward, self._vec_normalize_env)
