@@ -159,11 +159,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             )
             if self._sampler_state is not None:
                 self._replay_buffer.set_rng_state(self._sampler_state)
-            try:
-                self._prepare_data()
-            except BaseException:
-                self._replay_buffer = None  # never learn from data that are half prepared
-                raise
+            self._prepare_or_forget()
         return self._replay_buffer
 
     @replay_buffer.setter
@@ -178,6 +174,14 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def _data_sources(self) -> tuple[Any, ...]:
         """What the buffer is made of: it is made anew when one of these is replaced."""
         return (self.dataset,)
+
+    def _prepare_or_forget(self) -> None:
+        """Prepare the data, or forget the buffer: never learn from data that are half prepared."""
+        try:
+            self._prepare_data()
+        except BaseException:
+            self._replay_buffer = None
+            raise
 
     def _prepare_data(self) -> None:
         """Called when the dataset was opened, before the first batch is drawn."""
@@ -219,11 +223,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         # What was made with the other normaliser is made anew
         rewards = buffer.rewards
         buffer.restore_rewards()
-        try:
-            self._prepare_data()
-        except BaseException:
-            self._replay_buffer = None
-            raise
+        self._prepare_or_forget()
         if not buffer.is_relabelled:
             buffer.rewards = rewards  # of load_replay_buffer
 
