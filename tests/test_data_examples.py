@@ -96,6 +96,14 @@ def test_unfit_arrays(tmp_path, source, message):
         load_examples(source, IMAGES)
 
 
+@pytest.mark.parametrize(
+    ("space", "row"), [(spaces.Discrete(3, start=1), 4), (spaces.MultiDiscrete([2, 3]), [2, 0]), (spaces.Discrete(3), -1)]
+)
+def test_choices_that_there_are_not(space, row):
+    with pytest.raises(DatasetError, match=r"examples: holds .* in row 1, which is not in (Multi)?Discrete"):
+        load_examples(np.array([space.sample(), row]), space)
+
+
 def test_unfit_files(tmp_path):
     def fails(source, message, space=IMAGES):
         with pytest.raises(DatasetError, match=message) as caught:

@@ -53,6 +53,8 @@ def test_an_interrupted_conversion_leaves_nothing(tmp_path, monkeypatch):
     before = (tmp_path / "b.h5").read_bytes()
     with pytest.raises(DatasetError, match=r"b.h5: file: exists already"):
         convert(tmp_path / "a.h5", tmp_path / "b.h5", "compressed")
+    with pytest.raises(TypeError, match="storage is 'zip'; choose 'contiguous' or 'compressed'"):
+        convert(tmp_path / "a.h5", tmp_path / "c.h5", "zip", progress_bar=False)
 
     def interrupt(*args):
         raise KeyboardInterrupt

@@ -166,6 +166,8 @@ def test_success_counts_at_any_step():
     gym.register("Blinks-v0", Blinks)
     policy = ALGOS["bc"]("MlpPolicy", Blinks())
     assert evaluate_success(policy, "Blinks-v0", {}, n_episodes=4).successes == [True, False, True, False]
+    with pytest.raises(ValueError, match="0 episodes say nothing"):
+        evaluate_success(policy, "Blinks-v0", {}, n_episodes=0)
 
 
 def test_success_interval_is_wilsons():

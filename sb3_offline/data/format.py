@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import h5py
 import numpy as np
@@ -160,6 +160,8 @@ def create_file(
     :param committed: what ``n_episodes`` in the file says: how many episodes exist
     :param storage: "contiguous" (for training) or "compressed" (for keeping and sending)
     """
+    if storage not in get_args(Storage):
+        raise TypeError(f"storage is {storage!r}; choose 'contiguous' or 'compressed'")
     # Arrays at whole pages: a memory-mapped row then touches no more pages than it must.
     with h5py.File(path, "w", locking=False, alignment_threshold=4096, alignment_interval=4096) as file:
         for name, value in header.attributes().items():

@@ -28,7 +28,11 @@ class _Mixed:
         self.data_ratio = data_ratio
         seed = np.random.randint(2**31)  # SB3 seeds NumPy's generator, which its own buffers draw from
         self.offline = OfflineReplayBuffer(
-            dataset, self.observation_space, self.action_space, self.device, seed=seed  # type: ignore[attr-defined]
+            dataset,
+            self.observation_space,
+            self.action_space,
+            self.device,
+            seed=seed,  # type: ignore[attr-defined]
         )
         if rewards is not None:
             if len(rewards) != self.offline.size() or checksum not in (None, self.offline.checksum()):

@@ -122,6 +122,8 @@ def check_observations(
         # Only images: the bounds of other observations are often a guess that environments do not keep
         if isinstance(subspace, spaces.Box) and dtype.kind == "f" and len(shape) == 3 and checked[field].size:
             _check_range(checked[field], subspace.low.min(), subspace.high.max(), file, field)
+        elif isinstance(subspace, spaces.Discrete | spaces.MultiDiscrete):
+            _check_choices(checked[field], subspace, file, field)
     return checked
 
 
@@ -206,3 +208,14 @@ def _check_range(array: np.ndarray, low: Any, high: Any, file: str | os.PathLike
     if smallest < low or largest > high:
         problem = f"holds values in [{smallest}, {largest}], outside of the range [{low}, {high}]"
         raise DatasetError(file, field, problem, "Rescale the values to the space, or declare the space that they have")
+
+
+def _check_choices(
+    array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete, file: str | os.PathLike, field: str
+) -> None:
+    n_choices = space.n if isinstance(space, spaces.Discrete) else space.nvec
+    outside = ((array < space.start) | (array >= space.start + n_choices)).reshape(len(array), -1).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        problem = f"holds {array[row]} in row {row}, which is not in {space}"
+        raise DatasetError(file, field, problem, "Repair the values, or declare the space that they have")

@@ -68,10 +68,12 @@ def evaluate_success(
     :param model: a model, or a policy of one
     :param env_id: registered id; its ``info`` must say ``is_success``
     :param env_kwargs: of the environment
-    :param n_episodes: how many
+    :param n_episodes: how many, at least one
     :param seed: of the episodes
     :return: what came out
     """
+    if n_episodes < 1:
+        raise ValueError(f"{n_episodes} episodes say nothing; play at least one")
     env = make_evaluation_env(env_id, env_kwargs, seed)
     successes: list[bool] = []
     solved = False
