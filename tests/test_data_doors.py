@@ -85,6 +85,8 @@ def test_from_minari_and_back(minari, tmp_path):
             "success": np.arange(n + 1) > 2,
             "state": {"qpos": rng.normal(size=(n + 1, 3)), "a.b": np.zeros(n + 1)},
             "stage": [f"stage {t}" for t in range(n + 1)],
+            "state.qpos": rng.normal(size=n + 1),
+            "reset.late": rng.normal(size=n),
             "late": rng.normal(size=n),
         }
         buffers.append(

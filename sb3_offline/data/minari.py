@@ -160,6 +160,8 @@ def _infos_as_extras(
             warnings.warn(f"{path}: infos/{'/'.join(keys)}: {problem}; it is left out.")
             continue
         name, has_reset = ".".join(keys), resets == {1}
+        while {name, f"reset.{name}", name.removeprefix("reset.")} & extras.keys():  # {"a": {"b": ...}} beside {"a.b": ...}
+            name += "_"
         rows = np.concatenate([part[int(has_reset) :] for part in parts])
         extras[name] = rows.astype("S") if texts else rows
         undo[name] = {"keys": list(keys), "reset": has_reset}
