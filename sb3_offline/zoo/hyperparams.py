@@ -52,7 +52,7 @@ SPACES: dict[str, dict[str, Suggestion]] = {
         "state_exponent": _uniform(0, 4),
     },
     "cql": _CQL,
-    "dcql": {**_CQL, "ent_coef": _log(1e-5, 0.1), "distance": _choice("l2", "mse"), "reward_scale": _log(0.1, 10)},
+    "dcql": {**_CQL, "ent_coef": _log(1e-5, 0.1), "distance": _choice("l2", "mse"), "reward_scale": _log(1e-3, 10)},
     "iql": {**_BOOTSTRAPPING, "expectile": _uniform(0.5, 0.95), "inverse_temperature": _log(0.5, 10)},
     "oril": {
         **_CQL,
