@@ -136,7 +136,7 @@ def collect_shard(
     mode: Literal["x", "a"] = "x"
     if path.exists():
         mode, present = "a", OfflineDataset(path)
-        if present.provenance != provenance:
+        if present.provenance != provenance or present.sources != [*collection.tasks]:  # in this order they take turns
             problem = "holds other data than these options ask for"
             raise DatasetError(path, "provenance", problem, "Name another file, or delete this one")
         jobs = jobs[present.n_episodes :]

@@ -26,7 +26,11 @@ def find_warnings(data: JoinedDatasets, arrays: dict[str, ArrayStatistics]) -> l
     :param arrays: from ``array_statistics``
     :return: what looks wrong
     """
-    found = [*_action_warnings(data), *_label_warnings(data)]
+    remedy = "Inspect these files one by one, or write them anew with the same arrays"
+    found = [
+        DataWarning(name, "is not in all of the files in one shape and dtype: left out", remedy) for name in data.left_out
+    ]
+    found += [*_action_warnings(data), *_label_warnings(data)]
     plain = subspaces(data.observation_space, "observations")
     for name, statistics in arrays.items():
         is_label = name.startswith("episodes/") or statistics.array.dtype == bool

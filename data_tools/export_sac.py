@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import replacing
 from sb3_offline.data_tools.rollout import ENV_ID, versions
 from sb3_offline.data_tools.sac_policies import file_sha256, load_actor
 from sb3_offline.data_tools.train_sac import SETTINGS, evaluate_actor, read_curve
@@ -45,30 +46,43 @@ def run(args: argparse.Namespace) -> None:
     ]
     if not jobs:
         raise DatasetError(args.runs[0], "curve.csv", "is in no task's folder", "Run sb3-offline train-sac first")
-    measured = map_in_order(functools.partial(_measure, n_episodes=args.episodes), jobs, args.workers)
-    args.output.mkdir(parents=True, exist_ok=True)
+    names = [run.resolve().name for run in args.runs]
+    if len({*names}) < len(names):
+        remedy = "Checkpoints are named after it: rename one of the folders"
+        raise DatasetError(args.runs[0], "name", f"is not the only one of {', '.join(names)}", remedy)
     index = args.output / "policies.json"
     tasks: dict[str, Any] = json.loads(index.read_text())["tasks"] if index.exists() else {}
+    before = _files(tasks)
     for task in {task for task, _ in jobs}:
         tasks[task] = {
             "algorithm": "stable_baselines3.SAC, MlpPolicy, state observations",
-            "runs": {run.name: _provenance(run / task) for run in args.runs if (run / task / "curve.csv").exists()},
+            "runs": {run.resolve().name: _provenance(run / task) for run in args.runs if (run / task / "curve.csv").exists()},
             "checkpoints": [],
         }
+    sources = {}
+    measured = map_in_order(functools.partial(_measure, n_episodes=args.episodes), jobs, args.workers)
     for (task, path), successes in zip(jobs, measured, strict=True):
-        run_name = path.parent.parent.parent.name
+        run_name = path.resolve().parent.parent.parent.name
         checkpoint = {"file": f"{task}_{run_name}_{path.name}", "run": run_name, "step": int(path.stem)}
-        shutil.copyfile(path, args.output / checkpoint["file"])
+        sources[checkpoint["file"]] = path
         measurement = {"sha256": file_sha256(path), "successes": successes, "episodes": args.episodes}
         tasks[task]["checkpoints"].append({**checkpoint, **measurement})
         print(
             f"{task:<12} after {int(path.stem):>7} decisions of {run_name}: {successes} of {args.episodes} solved", flush=True
         )
-    kept = {checkpoint["file"] for entry in tasks.values() for checkpoint in entry["checkpoints"]}
-    for old in args.output.glob("*.npz"):
-        if old.name not in kept:
-            old.unlink()
-    index.write_text(json.dumps({"env_id": ENV_ID, "tasks": dict(sorted(tasks.items()))}, indent=2) + "\n")
+    # Not before all are measured: until here, an earlier export is whole
+    for name, path in sources.items():
+        with replacing(args.output / name) as temporary:
+            shutil.copyfile(path, temporary)
+    with replacing(index) as temporary:
+        temporary.write_text(json.dumps({"env_id": ENV_ID, "tasks": dict(sorted(tasks.items()))}, indent=2) + "\n")
+    for name in before - _files(tasks):
+        (args.output / name).unlink(missing_ok=True)
+
+
+def _files(tasks: dict[str, Any]) -> set[str]:
+    """:return: names of the checkpoints in an index"""
+    return {checkpoint["file"] for entry in tasks.values() for checkpoint in entry["checkpoints"]}
 
 
 def choose_checkpoints(folder: Path, n: int) -> list[Path]:

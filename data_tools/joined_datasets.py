@@ -47,7 +47,8 @@ class JoinedRows:
 class JoinedDatasets:
     """
     Reads like an ``OfflineDataset``, whose names it has: ``lengths``, ``step_starts``, ``observation_starts``, ``source``,
-    ``sources``, ``actions``, ``rewards``, ``success``, ... ``arrays`` holds those that all files have in the same shape.
+    ``sources``, ``actions``, ``rewards``, ``success``, ... ``arrays`` holds those that all files have in the same shape;
+    ``left_out`` names the others.
 
     :param source: path, glob pattern, ``OfflineDataset``, or a sequence of these; raises ``DatasetError`` where their
         environments differ
@@ -65,6 +66,7 @@ class JoinedDatasets:
         self.arrays = {
             name: JoinedRows([part.arrays[name] for part in self.parts]) for name in first.arrays if self._all(name)
         }
+        self.left_out = sorted({name for part in self.parts for name in part.arrays} - self.arrays.keys())
         small = {
             name: self.arrays[name][:] for name in ("actions", "rewards", "terminated", "truncated") if name in self.arrays
         }

@@ -122,7 +122,9 @@ def draw_moments(dataset: OfflineDataset, episode: int, moments: np.ndarray) -> 
 def _provenance(dataset: OfflineDataset, env: Any) -> dict[str, Any]:
     """What decides the bytes; a file is continued only where all of it is the same."""
     digest = hashlib.sha256()
-    for array in (dataset.lengths, dataset.actions, dataset.extras["scene_state"]):
+    for name in sorted(name for name in dataset.arrays if not name.startswith("observations")):
+        digest.update(name.encode())
+        array = dataset.arrays[name]
         for first in range(0, len(array), HASHED_ROWS):
             digest.update(np.asarray(array[first : first + HASHED_ROWS]).tobytes())
     provenance = {
@@ -132,6 +134,7 @@ def _provenance(dataset: OfflineDataset, env: Any) -> dict[str, Any]:
         "renderer": env.get_render_device(),
         "versions": {name: importlib.metadata.version(name) for name in ("metaworld", "mujoco")},
         "rendered": {"file": dataset.path.name, "sha256": digest.hexdigest(), "provenance": dataset.provenance},
+        "sources": dataset.sources,
     }
     return json.loads(json.dumps(provenance))  # as a file gives it back: lists for tuples
 

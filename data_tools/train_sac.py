@@ -11,7 +11,6 @@ import argparse
 import csv
 import functools
 import shutil
-import subprocess
 import time
 import warnings
 from pathlib import Path
@@ -24,7 +23,9 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
+from sb3_offline.common.provenance import current_commit
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import replacing
 from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.data_tools.workers import map_in_order
@@ -35,6 +36,8 @@ from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
 SOLVED = 0.9
 """Training stops when this share of evaluation episodes has been reached twice in a row."""
 EVAL_SEED = 1_000_000
+EPISODE = 50
+"""Decisions of an episode."""
 
 _BASE: dict[str, Any] = {
     "learning_rate": 7e-4,
@@ -65,7 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "output", type=Path, help="folder: one per task in it, with curve.csv, policies/ and the state to go on from"
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task")
+    parser.add_argument(
+        "-n", "--n-timesteps", type=int, default=200_000, help="decisions of each task, rounded up to whole slices"
+    )
     parser.add_argument("--settings", choices=list(SETTINGS), default="n_step")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -79,6 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
+    if args.eval_freq < 1 or args.eval_freq % EPISODE:
+        raise ValueError(f"--eval-freq is {args.eval_freq}; give a multiple of {EPISODE}, whole episodes")
     train = functools.partial(_train_task, args)
     folders = [args.output / task for task in args.tasks]
     for folder, curve in zip(folders, map_in_order(train, folders, args.workers), strict=True):
@@ -126,9 +133,10 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
     th.set_flush_denormal(True)  # else, Adam's tiny moments slow the updates down
     began = time.process_time()
     curve = read_curve(folder)
-    if curve and curve[-1]["settings"] != settings:
-        problem = f"holds a run with the settings {curve[-1]['settings']!r}"
-        raise DatasetError(folder / "curve.csv", "settings", problem, "Go on with these (--settings), or name another folder")
+    for name, wanted in (("settings", settings), ("seed", seed)):
+        if curve and curve[-1][name] != str(wanted):
+            problem, remedy = f"is {curve[-1][name]!r} in this run", f"Go on with it (--{name}), or name another folder"
+            raise DatasetError(folder / "curve.csv", name, problem, remedy)
     step = int(curve[-1]["step"]) if curve else 0
     (folder / "policies").mkdir(parents=True, exist_ok=True)
     index = TASKS.index(folder.name)
@@ -170,18 +178,16 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
         "cpu_seconds": round(time.process_time() - began, 1),
         "settings": settings,
         "seed": seed,
-        "commit": _commit(),
+        "commit": current_commit(),
     }
     state = folder / f"state_{step}"
     state.mkdir(exist_ok=True)
     model.save(state / "model.zip")
     model.save_replay_buffer(state / "replay_buffer.pkl")
-    temporary = folder / "curve.csv.tmp"
-    with temporary.open("w", newline="") as file:
+    with replacing(folder / "curve.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(row), lineterminator="\n")
         writer.writeheader()
         writer.writerows([*curve, row])
-    temporary.replace(folder / "curve.csv")
     for old in folder.glob("state_*"):
         if old != state:
             shutil.rmtree(old)
@@ -218,12 +224,3 @@ def evaluate_actor(
             returns[i] += float(reward)
         successes[i] = info["is_success"]
     return successes, returns
-
-
-def _commit() -> str:
-    """:return: of the source tree that this is run from, "" for an installed package"""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""

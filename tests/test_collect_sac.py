@@ -1,6 +1,7 @@
 """collect-sac: the same episodes for any number of workers, shards and restarts."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +60,8 @@ def test_workers_and_restarts_change_nothing(whole, tmp_path, monkeypatch):
     assert path.stat().st_mtime_ns == before
     with pytest.raises(DatasetError, match="other data"):
         collect_shard(path, Collection(EPISODES, COLLECTION.tasks, seed=4), progress=False)
+    with pytest.raises(DatasetError, match="other data"):  # the tasks take turns in another order
+        collect_shard(path, replace(COLLECTION, tasks=COLLECTION.tasks[::-1]), progress=False)
 
 
 def test_shards_are_the_whole_in_parts(whole, tmp_path):

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import h5py
 import numpy as np
 import pytest
-from data_files import ACTIONS, BOTH, IMAGES, STATES, make_episode, write_dataset
+from data_files import ACTIONS, BOTH, IMAGES, OPTIONS, STATES, make_episode, write_dataset
 from gymnasium import spaces
 
 from sb3_offline import cli
@@ -143,6 +143,17 @@ def test_shards_are_inspected_together(tmp_path, capsys):
     assert summary["groups"]["left"]["episodes"] == sum(e["source"] == "left" for part in parts for e in part)
     (warning,) = summary["warnings"]
     assert warning["problem"] == "2 repeat an earlier one (5, 6)" and "seed" in warning["remedy"]
+
+
+def test_labels_that_one_file_lacks_are_named(tmp_path, capsys):
+    write_dataset(tmp_path / "a.h5", 2, STATES)
+    episodes = [{k: v for k, v in make_episode(i, STATES).items() if k not in ("source", "success")} for i in (2, 3)]
+    with DatasetWriter(tmp_path / "b.h5", STATES, ACTIONS, **{**OPTIONS, "sources": None, "success": False}) as writer:
+        for episode in episodes:
+            writer.add_episode(**episode)
+    cli.main(["inspect", "--json", str(tmp_path / "a.h5"), str(tmp_path / "b.h5")])
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert {"episodes/source", "success"} == {w["field"] for w in warnings if "is not in all of the files" in w["problem"]}
 
 
 def test_examples_are_held_against_the_data(tmp_path, capsys):

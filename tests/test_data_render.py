@@ -92,6 +92,12 @@ def test_an_interrupted_run_is_continued(tmp_path, states, monkeypatch):
             render_dataset.render_dataset(states, parted, **{**options, **other})
     assert render_dataset.render_dataset(states, parted, **{**options, "frame_size": 17, "overwrite": True}) == 4
     assert OfflineDataset(parted).observation_space.shape == (17, 17, 3)
+    relabelled = tmp_path / "relabelled.h5"
+    relabelled.write_bytes(states.read_bytes())
+    with h5py.File(relabelled, "r+") as file:
+        file["success"][:] = True
+    with pytest.raises(DatasetError, match="is not of this source"):
+        render_dataset.render_dataset(relabelled, whole, **options)
 
 
 def test_what_cannot_be_drawn_is_named(tmp_path, states):

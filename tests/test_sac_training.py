@@ -50,7 +50,13 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, c
         assert [row["step"] for row in csv.DictReader(file)] == ["50", "100", "150"]
     with pytest.raises(SystemExit, match="settings"):
         _train(tmp_path / "stopped", 200, "--settings", "base")
+    with pytest.raises(SystemExit, match="seed: is '0' in this run"):
+        _train(tmp_path / "stopped", 200, "--seed", "1")
+    with pytest.raises(SystemExit, match="eval-freq is 70; give a multiple of 50"):
+        _train(tmp_path / "stopped", 200, "--eval-freq", "70")
 
+    (tmp_path / "policies").mkdir()
+    (tmp_path / "policies/mine.npz").write_bytes(b"of somebody else")
     command = ["export-sac", str(tmp_path / "stopped"), "-o", str(tmp_path / "policies"), "--checkpoints", "2"]
     cli.main([*command, "--episodes", "2", "--workers", "1"])
     policies = load_policies(tmp_path / "policies")
@@ -58,6 +64,12 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, c
     entry = json.loads((tmp_path / "policies/policies.json").read_text())["tasks"]["drawer-open"]
     assert entry["runs"]["stopped"]["trained_decisions"] == 150
     assert {"settings", "seed", "commit", "versions"} <= entry["runs"]["stopped"].keys()
+    cli.main([*command, "--episodes", "2", "--workers", "1", "--checkpoints", "1"])
+    names = {path.name for path in (tmp_path / "policies").iterdir()}
+    assert names == {"drawer-open_stopped_000150.npz", "mine.npz", "policies.json"}
+    with pytest.raises(SystemExit, match="name: is not the only one of stopped, stopped"):
+        cli.main([*command[:2], str(tmp_path / "other/stopped"), *command[2:]])
+    policies = load_policies(tmp_path / "policies")
     policies["drawer-open"][0].file.write_bytes(b"others")
     with pytest.raises(DatasetError, match="sha256"):
         load_policies(tmp_path / "policies")

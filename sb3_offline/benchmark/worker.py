@@ -3,15 +3,14 @@
 import importlib.metadata
 import json
 import os
-import subprocess
 import traceback
 from pathlib import Path
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-import sb3_offline
 from sb3_offline.benchmark.grid import Run
+from sb3_offline.common.provenance import current_commit
 from sb3_offline.data.files import lock_file, replacing
 from sb3_offline.experiment.training import train
 
@@ -35,6 +34,7 @@ def train_run(run: Run) -> None:
         lock.write(f"{os.getpid()}")  # for whoever wonders what is at it
         lock.flush()
         if run.is_finished():
+            (run.folder / FAILURE_FILE).unlink(missing_ok=True)  # left by a kill between the two
             return
         try:
             callbacks = [_Provenance(run.folder / PROVENANCE_FILE), *run.tables()]
@@ -75,22 +75,6 @@ class _Provenance(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-
-def current_commit() -> str:
-    """:return: the commit that the code is of, with a + where the code differs from it; "unknown" outside of a repository"""
-    root = Path(sb3_offline.__file__).parent.parent
-    code = ["sb3_offline", "zoo_configs", "data_tools"]
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        if not git("ls-files", "sb3_offline/version.txt"):
-            return "unknown"  # the repository is of something else, in which this package is installed
-        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(git("status", "--porcelain", *code))
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def versions() -> str:

@@ -27,13 +27,8 @@ class _Mixed:
             raise DatasetError("", "data_ratio", f"is {data_ratio}", "Give the share of a batch that the dataset has, 0 to 1")
         self.data_ratio = data_ratio
         seed = np.random.randint(2**31)  # SB3 seeds NumPy's generator, which its own buffers draw from
-        self.offline = OfflineReplayBuffer(
-            dataset,
-            self.observation_space,
-            self.action_space,
-            self.device,
-            seed=seed,  # type: ignore[attr-defined]
-        )
+        learner = self.observation_space, self.action_space, self.device  # type: ignore[attr-defined]
+        self.offline = OfflineReplayBuffer(dataset, *learner, seed=seed)
         if rewards is not None:
             if len(rewards) != self.offline.size() or checksum not in (None, self.offline.checksum()):
                 problem = f"are of other data: {len(rewards)} rewards, and the dataset has {self.offline.size()} steps"
