@@ -23,6 +23,10 @@ def main(argv: list[str] | None = None) -> None:
         if extra is None:
             raise
         sys.exit(f'sb3-offline: {error}; install it with: pip install "sb3-offline[{extra}]"')
+    except Exception as error:
+        if type(error).__module__ != "gymnasium.error":
+            raise
+        sys.exit(f"sb3-offline: {error}")
 
 
 _EXTRAS = {
@@ -125,7 +129,7 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
         find_algorithm(args.algo)  # before its config is looked for
 
         config = {**load_config(args.config or args.algo, args.env), **parse_overrides(args.hyperparams)}
-        if args.n_timesteps:
+        if args.n_timesteps is not None:
             config["n_timesteps"] = args.n_timesteps
         train(
             args.algo,
@@ -155,6 +159,8 @@ def _evaluate(parser: argparse.ArgumentParser) -> Callable:
     def run(args: argparse.Namespace) -> None:
         from sb3_offline.experiment.evaluation import evaluate_success
 
+        if args.gif and args.gif.suffix.lower() != ".gif":
+            sys.exit(f"sb3-offline: --gif {args.gif}: is no name of a GIF; end it in .gif")
         if args.model.suffix == ".npz":
             from sb3_offline.experiment.policy_file import load_policy as load
         else:
@@ -212,7 +218,7 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
         for line in run_grid(grid, args.runs, args.output, train, whole=whole):
             print(line, flush=True)
         if args.policies:
-            print(f"{export_policies(grid, args.runs, args.policies)} policies -> {args.policies}")
+            print(f"{export_policies(grid, args.runs, args.policies, whole)} policies -> {args.policies}")
 
     return run
 

@@ -21,9 +21,13 @@ from sb3_offline import cli
 from sb3_offline.benchmark import local
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
-from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, current_commit, train_run
+from sb3_offline.benchmark.table import table_writer
+from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, record_failure, train_run
+from sb3_offline.common.provenance import current_commit
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.policy_file import load_policy
-from sb3_offline.experiment.training import RESUME_FILE, load_run, train
+from sb3_offline.experiment.training import RESUME_FILE, load_run, run_record, train
+from sb3_offline.report.results import read_results, with_early_checkpoints
 
 TABLE = "evaluations-door-open.csv"
 
@@ -96,6 +100,13 @@ def test_a_run_goes_on_from_its_last_save(data, tmp_path):
     assert (stops.began, goes_on.began) == (0, 25)
 
 
+def test_a_run_knows_its_chosen_episodes_again(data):
+    def record(episodes):
+        return run_record("bc", "x", {}, dataset=OfflineDataset(data["dataset"]).select(episodes), examples=np.arange(2000))
+
+    assert record([0, 1]) == record([0, 1]) != record([0, 2])
+
+
 def test_a_run_that_goes_on_with_other_code_says_so(tmp_path):
     provenance = _Provenance(tmp_path / "provenance.json")
     for step, before, expected in ((5, "a", "a then NOW"), (5, "a then NOW", "a then NOW"), (0, "a", "NOW")):
@@ -162,9 +173,30 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path, capsys):
 def test_a_run_of_all_tasks_keeps_no_evaluation_of_an_earlier_one(data, tmp_path):
     for rate, tasks in ((1e-4, GRID["tasks"]), (1e-2, ["door-open"])):
         methods = {"bc": {"algo": "bc", "config": "bc", "changes": {"learning_rate": rate}}}
-        rows = run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods), "--tasks", *tasks)
+        run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods, tasks=tasks))
     rows = run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods), "--no-training")
     assert rows == []  # for the other task it has to be trained again
+
+
+def test_parts_of_a_grid_share_the_run_of_all_tasks(data, tmp_path):
+    grid = write_grid(tmp_path, data)
+    run_benchmark(tmp_path, grid, "--methods", "bc", "--tasks", "door-open")
+    model = tmp_path / "runs/bc/seed3/model.zip"
+    before = model.stat().st_mtime_ns
+    for task in ("drawer-open", "door-open"):
+        rows = run_benchmark(tmp_path, grid, "--methods", "bc", "--tasks", task)
+    assert len(rows) == 4 and model.stat().st_mtime_ns == before
+
+
+def test_two_processes_write_one_table(data, tmp_path):
+    """Each of its own cells, though both began before the other wrote any."""
+    grid = load_grid(write_grid(tmp_path, data, methods={"bc": GRID["methods"]["bc"]}, seeds=[3, 4]))
+    cells = [plan(grid.part(seeds=[seed]), tmp_path / "runs") for seed in grid.seeds]
+    writers = [table_writer(tmp_path / "table.csv", part, grid) for part in cells]
+    for part, write in zip(cells, writers, strict=True):
+        record_failure(next(iter(part.values())), "broke")
+        write()
+    assert [row["seed"] for row in read_results(tmp_path / "table.csv").rows] == ["3"] * 4 + ["4"] * 4
 
 
 def test_a_process_that_dies_again_and_again_is_a_failure(data, tmp_path, monkeypatch):
@@ -190,7 +222,6 @@ def test_a_method_may_have_data_of_its_own(data, tmp_path):
 def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
     pytest.importorskip("rliable")
     from sb3_offline.report import aggregates
-    from sb3_offline.report.results import read_results, with_early_checkpoints
 
     monkeypatch.setattr(aggregates, "REPETITIONS", 10)
     options = ["--methods", "ceborl", "bc", "--tasks", "door-open"]
@@ -213,6 +244,8 @@ def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
         ({"tasks": "door-open"}, "tasks: is 'door-open'; give a list"),
         ({"methods": {"x": {"algo": "bc"}}}, "methods: x: config: missing"),
         ({"save_freq": 0}, "save_freq: is 0"),
+        ({"tasks": [1, 2]}, r"tasks: is \[1, 2\]; give a list of names"),
+        ({"seeds": [0.5]}, r"seeds: is \[0.5\]; give a list of whole numbers"),
         ({"methods": {"a b": GRID["methods"]["bc"], "a-b": GRID["methods"]["bc"]}}, "share a folder"),
         ({"examples": None}, "ceborl learns from success examples"),
         ({"examples": "nowhere/{task}.h5"}, "no such success examples"),

@@ -76,6 +76,15 @@ def test_one_command_makes_the_report(table, tmp_path, monkeypatch):
             assert picture.width > 500
 
 
+def test_tables_of_one_name_are_refused(table, tmp_path):
+    """Their figures would be."""
+    other = tmp_path / "other" / table.name
+    other.parent.mkdir()
+    other.write_bytes(table.read_bytes())
+    with pytest.raises(SystemExit, match="rename those of one name"):
+        cli.main(["report", str(table), str(other), "-o", str(tmp_path / "report")])
+
+
 def test_an_unknown_reference_is_refused(table, tmp_path):
     with pytest.raises(SystemExit, match="no method 'cebrol'"):
         cli.main(["report", str(table), "-o", str(tmp_path / "report"), "--reference", "cebrol"])

@@ -1,6 +1,6 @@
 """What is trained and how it is counted: one YAML file."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -162,6 +162,10 @@ def load_grid(name: str) -> Grid:
     for key, kind in (("methods", Mapping), ("env_kwargs", Mapping), ("tasks", list), ("seeds", list)):
         if key in content and not (isinstance(content[key], kind) and (content[key] or key == "env_kwargs")):
             raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a {'list' if kind is list else 'section'}")
+    parts = {"tasks": (str, "names (quoted, if they look like numbers)"), "seeds": (int, "whole numbers")}
+    for key, (part_kind, what) in parts.items():
+        if not all(isinstance(part, part_kind) for part in content[key]):
+            raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a list of {what}")
     for key in ("n_timesteps", "save_freq", "checkpoints", "episodes"):
         if key in content and (not isinstance(content[key], int) or content[key] < 1):
             raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a whole number of at least 1")
@@ -185,32 +189,35 @@ def _checked(section: Any, kind: type, place: str) -> dict[str, Any]:
     return dict(section)
 
 
-def plan(grid: Grid, runs: Path) -> dict[tuple[str, str, int], Run]:
+def plan(grid: Grid, runs: Path, whole: Grid | None = None) -> dict[tuple[str, str, int], Run]:
     """
     :param grid: what is asked for
     :param runs: folder of all runs
+    :param whole: the grid that ``grid`` is a part of: what is trained once for all tasks is evaluated on all of its tasks
     :return: of each of the grid's cells, the run that fills it
     """
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
     configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in grid.methods.items()}
+    all_tasks = (whole or grid).tasks
     cells: dict[tuple[str, str, int], Run] = {}
     for name, task, seed in grid.cells():
         if _depends_on_task(grid, grid.methods[name], configs[name]):
-            cells[name, task, seed] = _run(grid, name, configs[name], seed, task, runs)
+            cells[name, task, seed] = _run(grid, name, configs[name], seed, task, [task], runs)
         else:
             first = cells.get((name, grid.tasks[0], seed))
-            cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, runs)
+            cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, all_tasks, runs)
     return cells
 
 
-def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | None, runs: Path) -> Run:
+def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | None, tasks: Sequence[str], runs: Path) -> Run:
     """
     :param config: of the method
-    :param task: ``None`` for a run of all tasks
+    :param task: that it is trained for; ``None`` for a run of all tasks
+    :param tasks: that it is evaluated on
     """
-    method, tasks = grid.methods[name], (task,) if task else tuple(grid.tasks)
+    method = grid.methods[name]
     dataset, examples = _data(grid, method)
     if _takes_examples(method) and examples is None:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
@@ -225,7 +232,7 @@ def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | N
         "env_kwargs": {"task": task} if task else {},
         "seed": seed,
     }
-    return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tasks, arguments, grid)
+    return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tuple(tasks), arguments, grid)
 
 
 def _takes_examples(method: Method) -> bool:

@@ -20,7 +20,7 @@ _IN_USE = 75  # the exit code of a process that found another one at its run
 def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
     """
     :param runs: that are not finished, in the order in which to start them
-    :param n_workers: processes
+    :param n_workers: processes; one where fewer are asked for
     :return: each run when it is finished or has failed. Where a process is killed, another goes on with its run, but not for
         ever. Raises ``RuntimeError`` at the end where runs are left to other processes
     """
@@ -30,7 +30,7 @@ def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
     kills: Counter[str] = Counter()
     try:
         while waiting or working:
-            while waiting and len(working) < n_workers:
+            while waiting and len(working) < max(n_workers, 1):
                 run = waiting.popleft()
                 process = context.Process(target=_work, args=(run,))
                 process.start()

@@ -29,7 +29,7 @@ def run_grid(
     :param whole: the grid that ``grid`` is a part of; rows in ``output`` of its other cells stay
     :return: what to tell the user, when it happens
     """
-    cells, began = plan(grid, runs), time.monotonic()
+    cells, began = plan(grid, runs, whole), time.monotonic()
     write = table_writer(output, cells, whole or grid)
     trainings = list({run.folder: run for run in cells.values()}.values())
     unfinished = [run for run in trainings if not run.is_finished()] if train else []
@@ -42,14 +42,15 @@ def run_grid(
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
 
 
-def export_policies(grid: Grid, runs: Path, folder: Path) -> int:
+def export_policies(grid: Grid, runs: Path, folder: Path, whole: Grid | None = None) -> int:
     """
     :param grid: whose runs are exported
     :param runs: folder of the runs
     :param folder: gets the final policy of each finished run as a file named like the run's folder
+    :param whole: the grid that ``grid`` is a part of
     :return: how many there are
     """
-    finished = {run.folder for run in plan(grid, runs).values() if run.is_finished()}
+    finished = {run.folder for run in plan(grid, runs, whole).values() if run.is_finished()}
     for source in sorted(finished):
         save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / "model.zip"))
     return len(finished)

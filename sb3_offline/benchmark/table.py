@@ -8,7 +8,7 @@ from typing import Any
 
 from sb3_offline.benchmark.grid import Grid, Run
 from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
-from sb3_offline.data.files import replacing
+from sb3_offline.data.files import locked_folder, replacing
 from sb3_offline.experiment.training import recorded_run
 
 FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
@@ -24,12 +24,13 @@ def table_writer(output: Path, cells: Mapping[tuple[str, str, int], Run], whole:
     """
     order = {cell: number for number, cell in enumerate(whole.cells())}
     files = [(output, FIELDS, table_rows), (curves_file(output), CURVE_FIELDS, curve_rows)]
-    kept = {path: _rows_of(path, {*order} - {*cells}, fields) for path, fields, _ in files}
 
     def write() -> None:
-        for path, fields, rows_of in files:
-            rows = [*kept[path], *rows_of(cells)]
-            write_table(path, sorted(rows, key=lambda row: order[row["method"], row["task"], int(row["seed"])]), fields)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with locked_folder(output.parent):  # another process may be at other cells of the same table
+            for path, fields, rows_of in files:
+                rows = [*_rows_of(path, {*order} - {*cells}, fields), *rows_of(cells)]
+                write_table(path, sorted(rows, key=lambda row: order[row["method"], row["task"], int(row["seed"])]), fields)
 
     return write
 

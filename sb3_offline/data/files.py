@@ -69,6 +69,28 @@ def lock_file(file: Any, path: Path) -> None:
         pass
 
 
+@contextlib.contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """
+    Wait for whoever else is in this block with the same folder: for files that are read, changed and replaced.
+
+    :param folder: an existing one
+    :return: context manager; without a lock where the system has none for folders
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def open_hdf5(path: str | os.PathLike) -> h5py.File:
     """
     :param path: an HDF5 file

@@ -23,6 +23,9 @@ def write_report(
     """
     if runs and len(runs) != len(tables):
         raise RuntimeError(f"There are {len(tables)} tables and {len(runs)} folders of runs; give one each, or no folder")
+    names = [table.stem for table in tables]
+    if len({*names}) < len(names):
+        raise RuntimeError(f"{', '.join(map(str, tables))}: figures are named after tables; rename those of one name")
     contents = [read_results(table) for table in tables]
     if not any(reference in results.methods for results in contents):
         raise RuntimeError(f"{', '.join(map(str, tables))}: there is no method {reference!r} to compare with (--reference)")
