@@ -112,6 +112,10 @@ def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "short.yml"], "short.yml: .*lacks n_timesteps"),
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "broken.yml"], "broken.yml: is not YAML"),
         (["train", "--dataset", "x.h5", "-o", "run", "--env", "No-v0", "--eval-freq", "1"], "no environment 'No-v0'"),
+        (["train", "--algo", "bc", "--dataset", "x.h5", "-o", "run", "-n", "0"], "n_timesteps is 0"),
+        (["train", "--algo", "bc", "--dataset", "x.h5", "-o", "run", "--eval-episodes", "0"], "n_eval_episodes is 0"),
+        (["train", "--dataset", "x.h5", "-o", "run", "--env", "no_module:No-v0", "--eval-freq", "1"], "no_module"),
+        (["evaluate", "nowhere/model.zip", "--gif", "gif"], "end it in .gif"),
         (["collect", "out.h5", "--tasks", "door-shut"], "door-shut"),
         (["collect", "short.yml/out.h5"], "short.yml"),
         (["collect-sac", "out.h5", "--episodes-per-task", "1", "--shard", "0/2"], "shards: are 2.*1 episodes"),
@@ -129,7 +133,8 @@ def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
 def test_shipped_configs_are_read_and_overwritten():
     assert load_config("ceborl", "MultimodalMetaworld-v0")["policy"] == "MlpPolicy"
     assert load_config("ceborl_pixels", "MultimodalMetaworld-v0")["env_kwargs"]["obs_type"] == "pixels"
-    assert parse_overrides(["policy_kwargs:dict(net_arch=[8])"]) == {"policy_kwargs": {"net_arch": [8]}}
+    nested = "policy_kwargs:dict(net_arch=dict(pi=[8], qf=[4]))"
+    assert parse_overrides([nested]) == {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [4]}}}
     assert parse_overrides(["tau:0.01", "mu:policy", "policy_kwargs:{'net_arch': [8]}"]) == {
         "tau": 0.01,
         "mu": "policy",

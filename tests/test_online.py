@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.utils import set_random_seed
 from test_algorithms import ACTIONS, CASES, POLICIES, STATES, ForbiddenEnv, batch_of, files, make  # noqa: F401
 
-from sb3_offline import BC
+from sb3_offline import BC, CQL
 from sb3_offline.common.online import export_sac
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.mixed import MixedDictReplayBuffer, MixedReplayBuffer
@@ -42,6 +42,8 @@ def test_sac_goes_on_from_the_same_policy(algo, policy, files, tmp_path):  # noq
 def test_what_cannot_be_exported_is_named(files, tmp_path):  # noqa: F811
     with pytest.raises(TypeError, match="BC has no critic"):
         export_sac(BC("MlpPolicy", None, files["MlpPolicy"][0]), tmp_path / "sac")
+    with pytest.raises(ValueError, match=r"data_ratio is 1\.5"):
+        export_sac(CQL("MlpPolicy", None, files["MlpPolicy"][0]), tmp_path / "sac", data_ratio=1.5)
 
 
 @pytest.mark.parametrize("space", [STATES, POLICIES["MultiInputPolicy"]])

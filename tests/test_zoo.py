@@ -40,6 +40,7 @@ TestZoo-v0:
   batch_size: 8
   policy_kwargs: dict(net_arch=[8], n_critics=3)
   normalize: true
+  learning_rate: 3e-4
 """
 TRAIN = "--algo ceborl --env TestZoo-v0 --conf-file my.yml --env-kwargs goal:2 --seed 1 --eval-episodes 2".split()
 
@@ -116,7 +117,14 @@ def test_optuna_study(run, tmp_path):
     model = CEBORL.load(latest)
     assert model.beta == float(rows[2]["params_beta"])
     sampled = HYPERPARAMS_SAMPLER["ceborl"](optuna.create_study().ask(), 2, 1, {})
-    for policy_kwargs in (model.policy_kwargs, sampled["policy_kwargs"]):  # what the config says, with another network
+    written = yaml.unsafe_load((latest.parent / "TestZoo-v0/config.yml").read_text())
+    assert written["policy_kwargs"] == {name: model.policy_kwargs[name] for name in written["policy_kwargs"]}
+    # What the config says, with another network
+    for policy_kwargs in (
+        model.policy_kwargs,
+        sampled["policy_kwargs"],
+        written["policy_kwargs"],
+    ):  # what the config says, with another network
         assert policy_kwargs["n_critics"] == 3 and policy_kwargs["net_arch"] != [8]
 
 
@@ -128,6 +136,7 @@ def test_optuna_study(run, tmp_path):
         (["-optimize", "--env-kwargs", "goal:3"], r"goal_3\.npy"),
         (["--hyperparams", "dataset:None"], r"my\.yml: names no dataset for TestZoo-v0.*--hyperparams"),
         (["--hyperparams", "dataset:'{place}.h5'"], "`dataset` names 'place'.*--env-kwargs"),
+        (["--hyperparams", "learning_rate:'lin'"], "not enough values|lin"),
         (["--hyperparams", "betaa:1"], "ceborl: .*'betaa'; check the config and --hyperparams"),
         (["--conf-file", "nothing.yml"], r"nothing\.yml"),
     ],

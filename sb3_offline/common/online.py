@@ -50,6 +50,8 @@ def export_sac(
     if not isinstance(model, ActorCriticAlgorithm):
         remedy = "export an actor-critic, such as CQL, IQL, TD3BC or CEBORL"
         raise TypeError(f"{type(model).__name__} has no critic that SAC could go on with; {remedy}")
+    if not 0 <= data_ratio <= 1:
+        raise ValueError(f"data_ratio is {data_ratio}; give a share between 0 and 1")
     keeps_critic = isinstance(model, RewardBasedAlgorithm)
     policy_kwargs = {k: v for k, v in model.policy_kwargs.items() if k != "critic_state_value"}
     if not keeps_critic:

@@ -14,7 +14,8 @@ class _Loader(yaml.SafeLoader):
     """Takes 3e-4 for a number, as YAML 1.2 and Python do, and not for text."""
 
 
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789"))
+_FLOAT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
 
 
 def config_path(name: str) -> Path:
@@ -62,7 +63,7 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
         raise RuntimeError(f"{path}: its section for {env_id} lacks {', '.join(sorted(missing))}; add it")
     config = dict(section)
     if isinstance(config.get("policy_kwargs"), str):  # files of the RL Zoo write Python: "dict(net_arch=[64, 64])"
-        config["policy_kwargs"] = _value(config["policy_kwargs"])
+        config["policy_kwargs"] = python_value(config["policy_kwargs"])
     return config
 
 
@@ -77,16 +78,30 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
         key, colon, text = pair.partition(":")
         if not colon or not key:
             raise RuntimeError(f"{pair!r} is not of the form key:value")
-        overrides[key] = _value(text)
+        overrides[key] = python_value(text)
     return overrides
 
 
-def _value(text: str) -> Any:
-    """:return: what a Python literal, or ``dict(name=literal)``, says; any other text as it is"""
+def python_value(text: str) -> Any:
+    """
+    :param text: as in files of the RL Zoo
+    :return: what a Python literal, or ``dict(name=literal)``, says; any other text as it is
+    """
     try:
-        call = ast.parse(text.strip(), mode="eval").body
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "dict" and not call.args:
-            return {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
-        return ast.literal_eval(text)
+        return _literal(ast.parse(text.strip(), mode="eval").body)
     except (ValueError, SyntaxError):
         return text
+
+
+def _literal(node: ast.expr) -> Any:
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dict" and not node.args:
+        return {str(keyword.arg): _literal(keyword.value) for keyword in node.keywords}
+    return ast.literal_eval(node)
+
+
+def number_or_text(value: Any) -> Any:
+    """
+    :param value: of a file that a YAML 1.1 loader read, as the RL Zoo's does
+    :return: what this module's loader reads: a number in place of the text "3e-4"
+    """
+    return float(value) if isinstance(value, str) and _FLOAT.match(value) else value

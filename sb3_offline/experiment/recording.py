@@ -46,7 +46,11 @@ def make_recording_env(env_id: str, env_kwargs: dict[str, Any], size: int) -> gy
     try:
         return gym.make(env_id, **{"width": size, "height": size, **arguments})
     except TypeError:  # it takes no size
+        pass
+    try:
         return gym.make(env_id, **arguments)
+    except TypeError as error:
+        raise RuntimeError(f"{env_id} draws no pictures ({error})") from error
 
 
 def record_gif(

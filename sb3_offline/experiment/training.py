@@ -1,12 +1,15 @@
 """One training run: a config, a dataset and examples become checkpoints and a table of evaluations."""
 
 import csv
+import importlib
 import json
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -17,6 +20,7 @@ from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.data import resolve_data
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success
 
@@ -247,7 +251,7 @@ def train(
     :param examples: success examples, for the algorithms that learn from them (default: the config's)
     :param env_kwargs: added to the config's
     :param seed: of the run
-    :param eval_freq: gradient steps between evaluations (0: none)
+    :param eval_freq: gradient steps between evaluations (0 or less: none)
     :param n_eval_episodes: episodes of each evaluation
     :param save_freq: gradient steps between two saves of all that the run needs to go on (0: none). A run that was killed
         goes on from the last one when it is started again with the same arguments, and ends as if it had never stopped.
@@ -259,11 +263,12 @@ def train(
     record = run_record(algo, env_id, config, dataset=dataset, examples=examples, env_kwargs=env_kwargs, seed=seed)
     config = {**config, "env_kwargs": record["env_kwargs"]}
     all_callbacks = list(callbacks)
-    if eval_freq:
-        try:
-            gym.spec(env_id)
-        except gym.error.Error as error:
-            raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
+    counts = {"n_timesteps": config["n_timesteps"], "n_eval_episodes": n_eval_episodes}
+    for name, count in counts.items():
+        if count < 1:
+            raise RuntimeError(f"{name} is {count}; give at least 1")
+    if eval_freq > 0:
+        _check_registered(env_id)
         table = output / "evaluations.csv"
         all_callbacks.append(EvaluationTable(table, env_id, config["env_kwargs"], eval_freq, n_eval_episodes, verbose=verbose))
     resume_file, model = output / RESUME_FILE, None
@@ -302,7 +307,27 @@ def run_record(
     all_env_kwargs = {**config.get("env_kwargs", {}), **(env_kwargs or {})}
     record = {"algo": algo, "env": env_id, **config, "env_kwargs": all_env_kwargs, "seed": seed, **_given(dataset, examples)}
     # Through JSON: paths and NumPy numbers become what a YAML file can hold.
-    return json.loads(json.dumps(record, default=str))
+    return json.loads(json.dumps(record, default=_identity))
+
+
+def _identity(value: Any) -> str:
+    """:return: what tells a value apart from others, also in another process"""
+    if isinstance(value, OfflineDataset):
+        return f"{value.path}, {value.n_episodes} episodes, {zlib.crc32(value.actions.tobytes()):08x}"
+    if isinstance(value, np.ndarray):
+        return f"array {value.shape}, {value.dtype}, {zlib.crc32(value.tobytes()):08x}"
+    return f"{value.__module__}.{value.__qualname__}" if callable(value) and hasattr(value, "__qualname__") else str(value)
+
+
+def _check_registered(env_id: str) -> None:
+    """:param env_id: of an environment to evaluate in; "module:id" imports the module first, as in ``gym.make``"""
+    module, _, name = env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        gym.spec(name)
+    except (gym.error.Error, ImportError) as error:
+        raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
 
 
 def is_finished(output: Path, arguments: dict[str, Any]) -> bool:

@@ -12,7 +12,7 @@ import sb3_offline
 from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import open_datasets
-from sb3_offline.experiment.config import config_path
+from sb3_offline.experiment.config import config_path, number_or_text, python_value
 from sb3_offline.experiment.data import resolve_data
 from sb3_offline.zoo.hyperparams import SPACES, sample_params
 
@@ -44,6 +44,13 @@ class OfflineExperimentManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         given, self.env_kwargs = self.env_kwargs, {}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if self.algo in sb3_offline.ALGOS:
+            hyperparams = {name: number_or_text(value) for name, value in hyperparams.items()}
+            if self._drawn_policy_kwargs:
+                own = hyperparams.get("policy_kwargs", {})
+                own = python_value(own) if isinstance(own, str) else own
+                hyperparams["policy_kwargs"] = {**own, **self._drawn_policy_kwargs}
+            saved_hyperparams.update(hyperparams)
         env_kwargs = {**hyperparams.get("env_kwargs", {}), **given}
         hyperparams["env_kwargs"] = saved_hyperparams["env_kwargs"] = self.args.env_kwargs = env_kwargs
         self.eval_env_kwargs = {**env_kwargs, **(self._eval_env_kwargs_args or {})}
@@ -66,8 +73,7 @@ class OfflineExperimentManager(ExperimentManager):
                 load_examples(hyperparams["examples"], datasets[0].observation_space)
         hyperparams, *rest = super()._preprocess_hyperparams(hyperparams)
         if self.algo in sb3_offline.ALGOS:
-            policy_kwargs = {**hyperparams.get("policy_kwargs", {}), **self._drawn_policy_kwargs}
-            hyperparams["policy_kwargs"] = policy_kwargs
+            policy_kwargs = hyperparams.setdefault("policy_kwargs", {})
             HYPERPARAMS_SAMPLER[self.algo] = partial(sample_params, SPACES[self.algo], policy_kwargs=policy_kwargs)
         return hyperparams, *rest
 

@@ -13,7 +13,7 @@ def main() -> None:
     """Train, or optimise with Optuna, as ``sys.argv`` says."""
     try:
         rl_zoo3.train.train()
-    except (RuntimeError, FileNotFoundError) as error:
+    except (RuntimeError, ValueError, FileNotFoundError) as error:
         sys.exit(f"sb3_offline.zoo.train: {error}")
 
 
