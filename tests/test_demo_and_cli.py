@@ -82,6 +82,10 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"typo\.h5"):
         cli.main([*train, "--eval-freq", "1", "-o", run])
     assert files() == before  # a run stays until the data of the next one are found good
+    config = tmp_path / "run/config.yml"
+    config.write_text(config.read_text().replace("env: MultimodalMetaworld-v0", "env: Gone-v0"))
+    with pytest.raises(SystemExit, match="Gone"):
+        cli.main(["evaluate", f"{run}/model.zip", "--episodes", "1"])
 
 
 @pytest.mark.parametrize("algo", ALGOS)
@@ -219,6 +223,9 @@ def test_any_environment_that_draws_pictures_is_recorded(tmp_path):
     assert record_gif(Still(1), "Grey-v0", {}, tmp_path / "grey.gif", n_episodes=2) == [False, False]
     with Image.open(tmp_path / "grey.gif") as picture:
         assert picture.size == (30, 20)
+    gym.register("Blind-v0", lambda: Grey())
+    with pytest.raises(RuntimeError, match="Blind-v0 draws no pictures"):
+        record_gif(Still(1), "Blind-v0", {}, tmp_path / "blind.gif")
 
 
 def test_recorded_episodes_are_those_of_the_evaluation(tmp_path):
