@@ -26,11 +26,7 @@ def find_warnings(data: JoinedDatasets, arrays: dict[str, ArrayStatistics]) -> l
     :param arrays: from ``array_statistics``
     :return: what looks wrong
     """
-    remedy = "Inspect these files one by one, or write them anew with the same arrays"
-    found = [
-        DataWarning(name, "is not in all of the files in one shape and dtype: left out", remedy) for name in data.left_out
-    ]
-    found += [*_action_warnings(data), *_label_warnings(data)]
+    found = [*_left_out_warnings(data), *_action_warnings(data), *_label_warnings(data)]
     plain = subspaces(data.observation_space, "observations")
     for name, statistics in arrays.items():
         is_label = name.startswith("episodes/") or statistics.array.dtype == bool
@@ -39,6 +35,12 @@ def find_warnings(data: JoinedDatasets, arrays: dict[str, ArrayStatistics]) -> l
         elif not is_label:
             found += _field_warnings(name, statistics, plain.get(name))
     return [*found, *_duplicate_warnings(data)]
+
+
+def _left_out_warnings(data: JoinedDatasets) -> Iterator[DataWarning]:
+    remedy = "Inspect these files one by one, or write them anew with the same arrays"
+    for name in data.left_out:
+        yield DataWarning(name, "is not in all of the files in one shape and dtype: left out", remedy)
 
 
 def _action_warnings(data: JoinedDatasets) -> Iterator[DataWarning]:

@@ -37,32 +37,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    jobs = [
-        (task, path)
-        for task in args.tasks
-        for run in args.runs
-        if (run / task / "curve.csv").exists()
-        for path in choose_checkpoints(run / task, args.checkpoints)
-    ]
-    if not jobs:
-        raise DatasetError(args.runs[0], "curve.csv", "is in no task's folder", "Run sb3-offline train-sac first")
     names = [run.resolve().name for run in args.runs]
     if len({*names}) < len(names):
         remedy = "Checkpoints are named after it: rename one of the folders"
         raise DatasetError(args.runs[0], "name", f"is not the only one of {', '.join(names)}", remedy)
+    folders = {
+        task: {name: run / task for name, run in zip(names, args.runs, strict=True) if (run / task / "curve.csv").exists()}
+        for task in args.tasks
+    }
+    jobs = [
+        (task, name, path)
+        for task, runs in folders.items()
+        for name, folder in runs.items()
+        for path in choose_checkpoints(folder, args.checkpoints)
+    ]
+    if not jobs:
+        raise DatasetError(args.runs[0], "curve.csv", "is in no task's folder", "Run sb3-offline train-sac first")
     index = args.output / "policies.json"
     tasks: dict[str, Any] = json.loads(index.read_text())["tasks"] if index.exists() else {}
     before = _files(tasks)
-    for task in {task for task, _ in jobs}:
+    for task in {task for task, _, _ in jobs}:
         tasks[task] = {
             "algorithm": "stable_baselines3.SAC, MlpPolicy, state observations",
-            "runs": {run.resolve().name: _provenance(run / task) for run in args.runs if (run / task / "curve.csv").exists()},
+            "runs": {name: _provenance(folder) for name, folder in folders[task].items()},
             "checkpoints": [],
         }
     sources = {}
     measured = map_in_order(functools.partial(_measure, n_episodes=args.episodes), jobs, args.workers)
-    for (task, path), successes in zip(jobs, measured, strict=True):
-        run_name = path.resolve().parent.parent.parent.name
+    for (task, run_name, path), successes in zip(jobs, measured, strict=True):
         checkpoint = {"file": f"{task}_{run_name}_{path.name}", "run": run_name, "step": int(path.stem)}
         sources[checkpoint["file"]] = path
         measurement = {"sha256": file_sha256(path), "successes": successes, "episodes": args.episodes}
@@ -96,8 +98,8 @@ def choose_checkpoints(folder: Path, n: int) -> list[Path]:
     return [folder / "policies" / f"{steps[i]:06d}.npz" for i in places]
 
 
-def _measure(job: tuple[str, Path], n_episodes: int) -> int:
-    task, path = job
+def _measure(job: tuple[str, str, Path], n_episodes: int) -> int:
+    task, _, path = job
     successes, _ = evaluate_actor(load_actor(path), _env(task), n_episodes, seed=MEASURE_SEED, sample=True)
     return int(successes.sum())
 

@@ -30,14 +30,12 @@ from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs.multimodal_metaworld import TASKS
-from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
+from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH, STATE_NAMES
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
 
 SOLVED = 0.9
 """Training stops when this share of evaluation episodes has been reached twice in a row."""
 EVAL_SEED = 1_000_000
-EPISODE = 50
-"""Decisions of an episode."""
 
 _BASE: dict[str, Any] = {
     "learning_rate": 7e-4,
@@ -84,8 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: what ``add_arguments`` asks for"""
-    if args.eval_freq < 1 or args.eval_freq % EPISODE:
-        raise ValueError(f"--eval-freq is {args.eval_freq}; give a multiple of {EPISODE}, whole episodes")
+    if args.eval_freq < 1 or args.eval_freq % EPISODE_LENGTH:
+        raise ValueError(f"--eval-freq is {args.eval_freq}; give a multiple of {EPISODE_LENGTH}, whole episodes")
     train = functools.partial(_train_task, args)
     folders = [args.output / task for task in args.tasks]
     for folder, curve in zip(folders, map_in_order(train, folders, args.workers), strict=True):

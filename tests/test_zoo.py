@@ -120,11 +120,7 @@ def test_optuna_study(run, tmp_path):
     written = yaml.unsafe_load((latest.parent / "TestZoo-v0/config.yml").read_text())
     assert written["policy_kwargs"] == {name: model.policy_kwargs[name] for name in written["policy_kwargs"]}
     # What the config says, with another network
-    for policy_kwargs in (
-        model.policy_kwargs,
-        sampled["policy_kwargs"],
-        written["policy_kwargs"],
-    ):  # what the config says, with another network
+    for policy_kwargs in (model.policy_kwargs, sampled["policy_kwargs"], written["policy_kwargs"]):
         assert policy_kwargs["n_critics"] == 3 and policy_kwargs["net_arch"] != [8]
 
 

@@ -49,19 +49,20 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def lock_file(file: Any, path: Path) -> None:
+def lock_file(file: Any, path: Path, *, wait: bool = False) -> None:
     """
     Refuse a second writer: two would write over each other's work. The lock goes with the process, also when killed.
 
     :param file: open; closing it frees the lock
     :param path: for the ``DatasetError`` that is raised where another process holds it
+    :param wait: wait for that process instead
     """
     if sys.platform == "win32":
         return
     import fcntl
 
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         remedy = "Wait until it is done, or write to another file"
         raise DatasetError(path, "file", "is being written by another process", remedy) from error
@@ -77,15 +78,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
     :param folder: an existing one
     :return: context manager; without a lock where the system has none for folders
     """
-    if sys.platform == "win32":
+    if sys.platform == "win32":  # where folders cannot be opened
         yield
         return
-    import fcntl
-
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError):  # some network file systems have no locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        lock_file(descriptor, folder, wait=True)
         yield
     finally:
         os.close(descriptor)

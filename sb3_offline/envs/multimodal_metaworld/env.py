@@ -22,6 +22,8 @@ STATE_NAMES = (
     *("puck_x", "puck_y", "puck_goal_x", "puck_goal_y"),
 )
 """What the entries of a state observation are: metres and radians, the gripper's opening in [0, 1]."""
+EPISODE_LENGTH = 50
+"""Decisions in an episode, unless told otherwise."""
 # Wide enough for every reachable value, joint limits being soft.
 _STATE_BOUND = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
 
@@ -53,7 +55,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         task: str = "door-open",
         obs_type: str = "pixels",
         render_mode: str | None = None,
-        episode_length: int = 50,
+        episode_length: int = EPISODE_LENGTH,
         action_repeat: int = 4,
         width: int = 480,
         height: int = 480,
