@@ -15,7 +15,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from sb3_offline.benchmark.grid import Grid, Method
+from sb3_offline.benchmark.grid import Grid, Method, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import run_grid
 from sb3_offline.benchmark.table import write_table
@@ -98,7 +98,7 @@ def main() -> None:
     )
     train = None if args.no_training else functools.partial(train_locally, n_workers=args.workers)
     table = args.runs / "table.csv"
-    for line in run_grid(grid, args.runs, table, train):
+    for line in run_grid(grid, plan(grid, args.runs), table, train):
         write_variants(table, args.output)
         print(line, flush=True)
     plot(args.output, args.figure)

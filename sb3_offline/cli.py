@@ -201,7 +201,7 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument("--policies", type=Path, help="folder for the final policies as small files")
 
     def run(args: argparse.Namespace) -> None:
-        from sb3_offline.benchmark.grid import load_grid
+        from sb3_offline.benchmark.grid import load_grid, plan
         from sb3_offline.benchmark.runner import export_policies, run_grid
 
         train: Callable | None = None
@@ -213,12 +213,12 @@ def _benchmark(parser: argparse.ArgumentParser) -> Callable:
             from sb3_offline.benchmark.local import train_locally
 
             train = functools.partial(train_locally, n_workers=args.workers or os.cpu_count() or 1)
-        whole = load_grid(args.grid)
-        grid = whole.part(args.methods, args.tasks, args.seeds)
-        for line in run_grid(grid, args.runs, args.output, train, whole=whole):
+        grid = load_grid(args.grid)
+        cells = plan(grid, args.runs, grid.cells(args.methods, args.tasks, args.seeds))
+        for line in run_grid(grid, cells, args.output, train):
             print(line, flush=True)
         if args.policies:
-            print(f"{export_policies(grid, args.runs, args.policies, whole)} policies -> {args.policies}")
+            print(f"{export_policies(cells, args.runs, args.policies)} policies -> {args.policies}")
 
     return run
 

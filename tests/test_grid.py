@@ -55,8 +55,9 @@ def kill_once(run, file, n_lines, done):
 
 
 def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
-    grid = load_grid(write_grid(tmp_path, data, n_timesteps=200)).part(["ceborl", "cql"], ["door-open"])
-    whole, killed = (plan(grid, tmp_path / name) for name in ("whole", "killed"))
+    grid = load_grid(write_grid(tmp_path, data, n_timesteps=200))
+    chosen = grid.cells(["ceborl", "cql"], ["door-open"])
+    whole, killed = (plan(grid, tmp_path / name, chosen) for name in ("whole", "killed"))
     for run in whole.values():
         train_run(run)
     ceborl, cql = killed.values()
@@ -91,7 +92,8 @@ class _Interruption(BaseCallback):
 
 
 def test_a_run_goes_on_from_its_last_save(data, tmp_path):
-    (run,) = plan(load_grid(write_grid(tmp_path, data)).part(["ceborl"], ["door-open"]), tmp_path / "runs").values()
+    grid = load_grid(write_grid(tmp_path, data))
+    (run,) = plan(grid, tmp_path / "runs", grid.cells(["ceborl"], ["door-open"])).values()
     stops, goes_on = _Interruption(28), _Interruption(None)
     arguments = {**run.arguments, "save_freq": run.grid.save_freq, "progress_bar": False}
     with pytest.raises(KeyboardInterrupt):
@@ -191,8 +193,8 @@ def test_parts_of_a_grid_share_the_run_of_all_tasks(data, tmp_path):
 def test_two_processes_write_one_table(data, tmp_path):
     """Each of its own cells, though both began before the other wrote any."""
     grid = load_grid(write_grid(tmp_path, data, methods={"bc": GRID["methods"]["bc"]}, seeds=[3, 4]))
-    cells = [plan(grid.part(seeds=[seed]), tmp_path / "runs") for seed in grid.seeds]
-    writers = [table_writer(tmp_path / "table.csv", part, grid) for part in cells]
+    cells = [plan(grid, tmp_path / "runs", grid.cells(seeds=[seed])) for seed in grid.seeds]
+    writers = [table_writer(tmp_path / "table.csv", grid, part) for part in cells]
     for part, write in zip(cells, writers, strict=True):
         record_failure(next(iter(part.values())), "broke")
         write()

@@ -22,8 +22,9 @@ pytestmark = pytest.mark.slow
 
 def test_a_killed_node_loses_nothing(tmp_path):
     data = collect_data(tmp_path)
-    grid = load_grid(write_grid(tmp_path, data, n_timesteps=1000)).part(["ceborl", "cql"], ["door-open"])
-    lost, whole = (plan(grid, tmp_path / name) for name in ("lost", "whole"))
+    grid = load_grid(write_grid(tmp_path, data, n_timesteps=1000))
+    chosen = grid.cells(["ceborl", "cql"], ["door-open"])
+    lost, whole = (plan(grid, tmp_path / name, chosen) for name in ("lost", "whole"))
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         other = cluster.add_node(num_cpus=1)

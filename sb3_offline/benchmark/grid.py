@@ -1,14 +1,17 @@
 """What is trained and how it is counted: one YAML file."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.experiment.config import load_config, read_yaml
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
 from sb3_offline.experiment.training import EvaluationTable, find_algorithm, is_finished, run_record
+
+#: Method, task and seed.
+Cell: TypeAlias = tuple[str, str, int]
 
 
 @dataclass(frozen=True)
@@ -69,31 +72,24 @@ class Grid:
                 f"need a multiple of {2 * self.checkpoints}"
             )
 
-    def part(
+    def cells(
         self, methods: Iterable[str] | None = None, tasks: Iterable[str] | None = None, seeds: Iterable[int] | None = None
-    ) -> "Grid":
+    ) -> list[Cell]:
         """
         :param methods: to keep (default: all)
         :param tasks: likewise
         :param seeds: likewise
-        :return: the grid of these alone
+        :return: method, task and seed of each cell. Seeds are outermost, so that a grid that was stopped early is one of fewer
+            seeds.
         """
-        chosen: dict[str, Any] = {"methods": methods, "tasks": tasks, "seeds": seeds}
-        for name, wanted in chosen.items():
+        chosen: dict[str, list[Any]] = {}
+        for name, wanted in {"methods": methods, "tasks": tasks, "seeds": seeds}.items():
             own = list(getattr(self, name))
             chosen[name] = own if wanted is None else list(wanted)
             unknown = [part for part in chosen[name] if part not in own]
             if unknown:
                 raise RuntimeError(f"The grid's {name} are {', '.join(map(str, own))}; it has no {unknown[0]}")
-        chosen["methods"] = {name: self.methods[name] for name in chosen["methods"]}
-        return replace(self, **chosen)
-
-    def cells(self) -> list[tuple[str, str, int]]:
-        """
-        :return: method, task and seed of each cell. Seeds are outermost, so that a grid that was stopped early is one of fewer
-            seeds.
-        """
-        return [(name, task, seed) for seed in self.seeds for task in self.tasks for name in self.methods]
+        return [(name, task, seed) for seed in chosen["seeds"] for task in chosen["tasks"] for name in chosen["methods"]]
 
     def evaluation_steps(self) -> list[int]:
         """:return: steps of the checkpoints that count"""
@@ -189,25 +185,27 @@ def _checked(section: Any, kind: type, place: str) -> dict[str, Any]:
     return dict(section)
 
 
-def plan(grid: Grid, runs: Path, whole: Grid | None = None) -> dict[tuple[str, str, int], Run]:
+def plan(grid: Grid, runs: Path, chosen: Sequence[Cell] | None = None) -> dict[Cell, Run]:
     """
-    :param grid: what is asked for
+    :param grid: whose cells are filled
     :param runs: folder of all runs
-    :param whole: the grid that ``grid`` is a part of: what is trained once for all tasks is evaluated on all of its tasks
-    :return: of each of the grid's cells, the run that fills it
+    :param chosen: some of :meth:`Grid.cells` (default: all)
+    :return: of each of these, the run that fills it. What is trained once for all tasks is evaluated on all of the grid's,
+        whichever are chosen.
     """
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
     configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in grid.methods.items()}
-    all_tasks = (whole or grid).tasks
-    cells: dict[tuple[str, str, int], Run] = {}
-    for name, task, seed in grid.cells():
+    of_all_tasks: dict[tuple[str, int], Run] = {}
+    cells: dict[Cell, Run] = {}
+    for name, task, seed in grid.cells() if chosen is None else chosen:
         if _depends_on_task(grid, grid.methods[name], configs[name]):
             cells[name, task, seed] = _run(grid, name, configs[name], seed, task, [task], runs)
         else:
-            first = cells.get((name, grid.tasks[0], seed))
-            cells[name, task, seed] = first or _run(grid, name, configs[name], seed, None, all_tasks, runs)
+            if (name, seed) not in of_all_tasks:
+                of_all_tasks[name, seed] = _run(grid, name, configs[name], seed, None, grid.tasks, runs)
+            cells[name, task, seed] = of_all_tasks[name, seed]
     return cells
 
 

@@ -1,10 +1,10 @@
 """From a grid to its table."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from sb3_offline.benchmark.grid import Grid, Run, plan
+from sb3_offline.benchmark.grid import Cell, Grid, Run
 from sb3_offline.benchmark.table import failure_of, table_writer
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.policy_file import save_policy
@@ -12,25 +12,20 @@ from sb3_offline.experiment.training import load_run
 
 
 def run_grid(
-    grid: Grid,
-    runs: Path,
-    output: Path,
-    train: Callable[[list[Run]], Iterable[Run]] | None,
-    whole: Grid | None = None,
+    grid: Grid, cells: Mapping[Cell, Run], output: Path, train: Callable[[list[Run]], Iterable[Run]] | None
 ) -> Iterator[str]:
     """
     Train what is not finished, and write the table at once and after every run; all evaluations, for learning curves, go to
     :func:`~sb3_offline.benchmark.table.curves_file`.
 
-    :param grid: what is asked for
-    :param runs: folder of the runs
+    :param grid: whose table it is
+    :param cells: to fill, of :func:`~sb3_offline.benchmark.grid.plan`; rows in ``output`` of the grid's other cells stay
     :param output: CSV file
     :param train: trains runs and gives back each when it is over; ``None`` to write the table of what is finished
-    :param whole: the grid that ``grid`` is a part of; rows in ``output`` of its other cells stay
     :return: what to tell the user, when it happens
     """
-    cells, began = plan(grid, runs, whole), time.monotonic()
-    write = table_writer(output, cells, whole or grid)
+    began = time.monotonic()
+    write = table_writer(output, grid, cells)
     trainings = list({run.folder: run for run in cells.values()}.values())
     unfinished = [run for run in trainings if not run.is_finished()] if train else []
     _check_files(unfinished)
@@ -42,15 +37,14 @@ def run_grid(
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
 
 
-def export_policies(grid: Grid, runs: Path, folder: Path, whole: Grid | None = None) -> int:
+def export_policies(cells: Mapping[Cell, Run], runs: Path, folder: Path) -> int:
     """
-    :param grid: whose runs are exported
+    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
     :param runs: folder of the runs
     :param folder: gets the final policy of each finished run as a file named like the run's folder
-    :param whole: the grid that ``grid`` is a part of
     :return: how many there are
     """
-    finished = {run.folder for run in plan(grid, runs, whole).values() if run.is_finished()}
+    finished = {run.folder for run in cells.values() if run.is_finished()}
     for source in sorted(finished):
         save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / "model.zip"))
     return len(finished)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_offline.benchmark.grid import Grid, Run
+from sb3_offline.benchmark.grid import Cell, Grid, Run
 from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
 from sb3_offline.data.files import locked_folder, replacing
 from sb3_offline.experiment.training import recorded_run
@@ -15,14 +15,14 @@ FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "
 CURVE_FIELDS = ("method", "task", "seed", "step", "episodes", "successes")
 
 
-def table_writer(output: Path, cells: Mapping[tuple[str, str, int], Run], whole: Grid) -> Callable[[], None]:
+def table_writer(output: Path, grid: Grid, cells: Mapping[Cell, Run]) -> Callable[[], None]:
     """
     :param output: the table's CSV file
-    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
-    :param whole: the grid that these are a part of; rows of its other cells stay
+    :param grid: whose table it is
+    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`; rows of the grid's other cells stay
     :return: writes the table and the file of all evaluations beside it, as things stand
     """
-    order = {cell: number for number, cell in enumerate(whole.cells())}
+    order = {cell: number for number, cell in enumerate(grid.cells())}
     files = [(output, FIELDS, table_rows), (curves_file(output), CURVE_FIELDS, curve_rows)]
 
     def write() -> None:
@@ -35,7 +35,7 @@ def table_writer(output: Path, cells: Mapping[tuple[str, str, int], Run], whole:
     return write
 
 
-def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]]:
+def table_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
     """
     :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
     :return: rows of :data:`FIELDS` of the cells that are finished or have failed. In a failed one the checkpoints that it
@@ -60,7 +60,7 @@ def table_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]
     return rows
 
 
-def curve_rows(cells: Mapping[tuple[str, str, int], Run]) -> list[dict[str, Any]]:
+def curve_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
     """
     :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
     :return: rows of :data:`CURVE_FIELDS` of the cells that are finished or have failed: all their evaluations, also those of
@@ -83,7 +83,7 @@ def curves_file(table: Path) -> Path:
     return table.with_name(f"{table.stem}_curves.csv")
 
 
-def _rows_of(path: Path, wanted: set[tuple[str, str, int]], fields: Sequence[str]) -> list[dict[str, Any]]:
+def _rows_of(path: Path, wanted: set[Cell], fields: Sequence[str]) -> list[dict[str, Any]]:
     """
     :param path: of the CSV file of an earlier call, if there was one
     :param wanted: cells
