@@ -20,7 +20,7 @@ from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import run_grid
 from sb3_offline.benchmark.table import write_table
 from sb3_offline.ceborl import PAPER_FORM
-from sb3_offline.data_tools.rollout import ENV_ID
+from sb3_offline.envs import ENV_ID
 from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.experiment.evaluation import success_interval
 

@@ -12,12 +12,12 @@ from sb3_offline.data_tools.array_statistics import array_statistics
 from sb3_offline.data_tools.dataset_warnings import find_warnings
 from sb3_offline.data_tools.example_check import check_examples
 from sb3_offline.data_tools.joined_datasets import JoinedDatasets
+from sb3_offline.envs import ENV_ID
 
 SATURATED = 0.99
 """An action counts as saturated beyond this share of its bound."""
 CELL = 0.02
 """Metres: where the hand goes is counted in cells of this size."""
-METAWORLD = "MultimodalMetaworld-v0"
 
 
 def inspect_dataset(
@@ -106,7 +106,7 @@ def episode_returns(data: JoinedDatasets) -> np.ndarray | None:
 
 def task_names(data: JoinedDatasets) -> list[str]:
     """:return: the tasks of the columns of ``task_success`` and ``task_reward``; empty where the data have none"""
-    if data.env_id != METAWORLD or not {"extras/task_success", "extras/task_reward"} <= data.arrays.keys():
+    if data.env_id != ENV_ID or not {"extras/task_success", "extras/task_reward"} <= data.arrays.keys():
         return []
     try:
         from sb3_offline.envs.multimodal_metaworld import TASKS
@@ -186,7 +186,7 @@ class Coverage(NamedTuple):
 
 def table_coverage(data: JoinedDatasets) -> Coverage | None:
     """:return: ``None`` where the data do not say where the hand is"""
-    if data.env_id != METAWORLD or not data.n_episodes:
+    if data.env_id != ENV_ID or not data.n_episodes:
         return None
     try:
         from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, scene

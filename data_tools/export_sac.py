@@ -15,10 +15,11 @@ import numpy as np
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
-from sb3_offline.data_tools.rollout import ENV_ID, versions
+from sb3_offline.data_tools.rollout import versions
 from sb3_offline.data_tools.sac_policies import file_sha256, load_actor
 from sb3_offline.data_tools.train_sac import SETTINGS, evaluate_actor, read_curve
 from sb3_offline.data_tools.workers import map_in_order
+from sb3_offline.envs import ENV_ID
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
 MEASURE_SEED = 2_000_000

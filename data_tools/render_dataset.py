@@ -16,18 +16,17 @@ import gymnasium as gym
 import numpy as np
 from tqdm.auto import tqdm
 
-import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import open_hdf5
 from sb3_offline.data.format import read_header
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.data_tools.workers import map_in_order
+from sb3_offline.envs import ENV_ID
 
 if TYPE_CHECKING:
     from sb3_offline.envs.multimodal_metaworld.scene import TableScene
 
-ENV_ID = "MultimodalMetaworld-v0"
 STATE = "extras/scene_state"
 HASHED_ROWS = 1 << 16
 

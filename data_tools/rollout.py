@@ -12,12 +12,11 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.envs import ENV_ID
 from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
 
-ENV_ID = "MultimodalMetaworld-v0"
 _EXTRAS: dict[str, tuple[tuple[int, ...], str]] = {
     "task_success": ((5,), "bool"),
     "task_reward": ((5,), "float32"),

@@ -26,9 +26,9 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from sb3_offline.common.provenance import current_commit
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
-from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.data_tools.workers import map_in_order
+from sb3_offline.envs import ENV_ID
 from sb3_offline.envs.multimodal_metaworld import TASKS
 from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH, STATE_NAMES
 from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-ENV_ID = "MultimodalMetaworld-v0"
+from sb3_offline.envs import ENV_ID
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -2,7 +2,8 @@
 
 import pytest
 
-from sb3_offline.demo.pipeline import ENV_ID, DemoSettings, collect, training_run
+from sb3_offline.demo.pipeline import DemoSettings, collect, training_run
+from sb3_offline.envs import ENV_ID
 from sb3_offline.experiment.evaluation import evaluate_success
 from sb3_offline.experiment.training import train
 

@@ -17,9 +17,9 @@ from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data_tools.collect_scripted import BEHAVIOUR, TASKS, collect_scripted
 from sb3_offline.data_tools.extract_examples import extract_examples
-from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.demo import plots
 from sb3_offline.demo.trajectories import judge_trajectories, pick_trajectories
+from sb3_offline.envs import ENV_ID
 from sb3_offline.experiment.config import load_config
 from sb3_offline.experiment.evaluation import evaluate_success, success_interval
 from sb3_offline.experiment.parallel import train_in_parallel

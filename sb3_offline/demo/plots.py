@@ -8,8 +8,8 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
-from sb3_offline.data_tools.rollout import ENV_ID
 from sb3_offline.demo.trajectories import JudgedTrajectories
+from sb3_offline.envs import ENV_ID
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

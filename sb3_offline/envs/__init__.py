@@ -2,6 +2,8 @@
 
 import gymnasium as gym
 
-if "MultimodalMetaworld-v0" not in gym.registry:
+ENV_ID = "MultimodalMetaworld-v0"
+
+if ENV_ID not in gym.registry:
     # No max_episode_steps: the environment truncates by itself, after its `episode_length`.
-    gym.register("MultimodalMetaworld-v0", entry_point="sb3_offline.envs.multimodal_metaworld:MultimodalMetaworldEnv")
+    gym.register(ENV_ID, entry_point="sb3_offline.envs.multimodal_metaworld:MultimodalMetaworldEnv")
