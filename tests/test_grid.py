@@ -259,7 +259,9 @@ def test_a_wrong_grid_is_refused_before_anything_runs(data, tmp_path, changes, m
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("name", ["table1_states", "table1_pixels", "ceborl_states", "ceborl_pixels"])
+@pytest.mark.parametrize(
+    "name", ["table1_states", "table1_pixels", "tuning_states", "tuning_pixels", "ceborl_states", "ceborl_pixels"]
+)
 def test_shipped_grids_can_be_planned(name, tmp_path):
     grid = load_grid(name)
     assert len(plan(grid, tmp_path)) == len(grid.methods) * len(grid.tasks) * len(grid.seeds)
