@@ -14,7 +14,7 @@ demo: $(READY)  ## the main job: collect, train CEBORL, evaluate, report into de
 demo-pixels: $(READY)  ## the same from 64x64 pictures into demo-pixels/ (about half an hour)
 	$(BIN)/sb3-offline demo --obs-type pixels --output demo-pixels
 
-states-table: $(READY)  ## all methods on all tasks from states, three seeds, into results/ceborl_states.csv (hours)
+states-table: $(READY)  ## CEBORL, RCE and BC on all tasks from states, three seeds, into results/ceborl_states.csv (hours)
 	$(BIN)/python benchmarks/scripted_data.py
 	$(BIN)/sb3-offline benchmark ceborl_states --runs runs/states_table --output results/ceborl_states.csv
 

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env", help="id of the environment, whose spaces and time limit count where the source declares none"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace the destination")
+    parser.add_argument("--overwrite", action="store_true", help="replace the destination, where it is a file")
 
 
 def run(args: argparse.Namespace) -> None:

@@ -13,11 +13,12 @@ from gymnasium import spaces
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.files import replacing
 from sb3_offline.data.spaces import subspaces
-from sb3_offline.data_tools.dataset_statistics import METAWORLD, action_histograms, episode_returns, solved_by, table_coverage
+from sb3_offline.data_tools.dataset_statistics import action_histograms, episode_returns, solved_by, table_coverage
 from sb3_offline.data_tools.inspect_dataset import format_examples
 from sb3_offline.data_tools.joined_datasets import JoinedDatasets
 from sb3_offline.data_tools.page_charts import ACCENT, GOOD, NEUTRAL, bar, curves, heat_map, histogram, png_uri, table
 from sb3_offline.data_tools.page_pictures import MOST_SOURCES, FilmStrip, film_strips, image_name, to_picture
+from sb3_offline.envs import ENV_ID
 
 MOST_EXAMPLES = 40
 
@@ -215,7 +216,7 @@ def _coverage(data: JoinedDatasets) -> str:
 
 
 def _film(data: JoinedDatasets) -> str:
-    if image_name(data) is None and data.env_id != METAWORLD:
+    if image_name(data) is None and data.env_id != ENV_ID:
         return ""
     try:
         strips = film_strips(data)

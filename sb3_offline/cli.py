@@ -151,7 +151,7 @@ def _train(parser: argparse.ArgumentParser) -> Callable:
 
 def _evaluate(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument("model", type=Path, help="model.zip of a run, or a policy of benchmark --policies")
-    parser.add_argument("--task", help="of the multimodal environment (default: the run's)")
+    parser.add_argument("--task", help="of the multimodal environment (default: the run's, where it was trained for one task)")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=100_000, help="of the episodes")
     parser.add_argument("--gif", type=Path, help="record some of them")
@@ -168,6 +168,8 @@ def _evaluate(parser: argparse.ArgumentParser) -> Callable:
         model, run_config = load(args.model)
         if args.task:
             run_config["env_kwargs"]["task"] = args.task
+        if run_config["env"] == ENV_ID and "task" not in run_config["env_kwargs"]:
+            sys.exit(f"sb3-offline: {args.model}: was trained for no task in particular; say which one it is to play: --task")
         result = evaluate_success(model, run_config["env"], run_config["env_kwargs"], args.episodes, args.seed)
         low, high = result.interval
         print(f"{sum(result.successes)} of {args.episodes} episodes solved: {result.success_rate:.2f} [{low:.2f}, {high:.2f}]")

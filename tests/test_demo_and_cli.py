@@ -73,6 +73,9 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     capsys.readouterr()
     cli.main(["evaluate", f"{run}/model.zip", "--episodes", "1"])
     assert "of 1 episodes solved" in capsys.readouterr().out
+    cli.main(["train", "--algo", "bc", "--dataset", held_out, "-n", "2", "-o", f"{run}-of-all"])
+    with pytest.raises(SystemExit, match="no task in particular"):
+        cli.main(["evaluate", f"{run}-of-all/model.zip", "--episodes", "1"])
 
     def files():
         return {file.name: file.read_bytes() for file in (tmp_path / "run").iterdir()}

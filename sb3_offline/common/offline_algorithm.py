@@ -53,11 +53,11 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param device: Device (cpu, cuda, ...) on which the code should be run.
-    :param seed: Seed for the pseudo random generators; batches are drawn from a generator of their own
+    :param seed: Seed for the pseudo random generators; the buffer draws batches from one of its own
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
-    #: whether ``train()`` needs the dataset's action at the next step (and so leaves out each episode's last step)
+    #: whether ``train()`` needs the dataset's action at the next step (an episode's last step is then its own successor)
     needs_next_actions: bool = False
     _replay_buffer: Any
     _opened_sources: tuple[Any, ...]

@@ -154,7 +154,8 @@ class OfflineCritic(ContinuousCritic):
     :param layer_norm: put a LayerNorm after each hidden linear layer of the heads
     :param output_bias: what the heads put out at first, for all states and actions
     :param state_value: whether to add a head that sees the state without an action
-    :param kwargs: see :class:`stable_baselines3.common.policies.ContinuousCritic`
+
+    The others are those of :class:`stable_baselines3.common.policies.ContinuousCritic`.
     """
 
     def __init__(

@@ -120,7 +120,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         return np.concatenate([d.arrays[name] for d in self.datasets])
 
     def _index_steps(self, lengths: np.ndarray) -> None:
-        """For every step its row of observations and the number of steps left from it; and the steps that may be sampled."""
+        """For every step its row of observations and the number of steps left from it."""
         n, starts = int(lengths.sum()), np.cumsum(lengths) - lengths
         step = np.arange(n)
         self._observation_rows = step + np.repeat(np.arange(len(lengths)), lengths)

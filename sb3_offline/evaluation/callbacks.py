@@ -29,8 +29,8 @@ class OfflineEvalCallback(BaseCallback):
 
     - ``td_error``: mean absolute error of the Bellman equation of the learned policy (for CEBORL and RCE, of the recursion of
       their probabilities). Small on the training data and large on held-out data: overfitting. Growing: divergence.
-    - ``initial_value``, ``initial_value_std``: what the critic makes of the episodes' first states. Far above
-      ``data_return``, the mean discounted return of the episodes: overestimation.
+    - ``initial_value``, ``initial_value_std``: what the critic makes of the episodes' first states (for CEBORL and RCE the
+      logit of C). Far above ``data_return``, the mean discounted return of the episodes: overestimation.
     - ``examples_accuracy``, ``_auc``, ``_calibration_error``: how a classifier of success tells held-out examples from
       held-out data, both counting the same
     - ``success_accuracy``, ``_auc``, ``_calibration_error``: how it tells states of which success comes from others, where the
