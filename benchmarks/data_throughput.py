@@ -24,13 +24,13 @@ import numpy as np
 import torch as th
 from throughput import ACTIONS, BATCH_SIZE, OBSERVATIONS, RESULTS, interleave, merge, one_step, ours, write_transitions
 
-import sb3_offline.envs  # noqa: F401  (registers the environment)
 from sb3_offline.common.augmentation import random_shift
 from sb3_offline.common.process import prepare_process
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.convert import convert
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.envs import ENV_ID
 
 EPISODE_LENGTH = 50
 FRAMES = OBSERVATIONS["pixels"]
@@ -190,7 +190,7 @@ def environment_entries() -> list[dict[str, Any]]:
     entries: list[dict[str, Any]] = []
     for obs_type in ("state", "pixels"):
         began = time.process_time()
-        env = gym.make("MultimodalMetaworld-v0", obs_type=obs_type)
+        env = gym.make(ENV_ID, obs_type=obs_type)
         env.reset(seed=0)
         entries.append({"name": f"environment_{obs_type}_first_reset", "ours_ms": round(1e3 * (time.process_time() - began))})
         env.action_space.seed(0)

@@ -156,8 +156,8 @@ def collect_scripted(
     Collect episodes and write them to one dataset file.
 
     A step's `success` is that of the attempted task, which is the episode's `source`; the file holds no `rewards`, since those
-    of five tasks would be mixed in it. Extras: `task_success`, `task_reward`, `state` and
-    `scene_state` of `TaskEpisode`.
+    of five tasks would be mixed in it. Extras: `task_success`, `task_reward`, `state` and `scene_state`
+    of `TaskEpisode`.
 
     :param path: of the file
     :param episodes_per_task: how many attempts at each task

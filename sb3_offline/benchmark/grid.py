@@ -196,11 +196,13 @@ def plan(grid: Grid, runs: Path, chosen: Sequence[Cell] | None = None) -> dict[C
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
-    configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in grid.methods.items()}
+    chosen = grid.cells() if chosen is None else chosen
+    methods = {name: grid.methods[name] for name, _, _ in chosen}  # configs of the others are not looked for
+    configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in methods.items()}
     of_all_tasks: dict[tuple[str, int], Run] = {}
     cells: dict[Cell, Run] = {}
-    for name, task, seed in grid.cells() if chosen is None else chosen:
-        if _depends_on_task(grid, grid.methods[name], configs[name]):
+    for name, task, seed in chosen:
+        if _depends_on_task(grid, methods[name], configs[name]):
             cells[name, task, seed] = _run(grid, name, configs[name], seed, task, [task], runs)
         else:
             if (name, seed) not in of_all_tasks:
