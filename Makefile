@@ -32,8 +32,10 @@ pytest: test
 lint: $(READY)
 	$(BIN)/ruff check .
 
-type: $(READY)
-	$(BIN)/mypy sb3_offline data_tools
+type: $(READY)  ## of the package as it is when installed, with data_tools inside
+	rm -rf $(VENV)/types && mkdir -p $(VENV)/types/sb3_offline
+	ln -s "$(CURDIR)"/sb3_offline/* "$(CURDIR)/data_tools" $(VENV)/types/sb3_offline
+	MYPYPATH=$(VENV)/types $(BIN)/mypy -p sb3_offline
 
 format: $(READY)
 	$(BIN)/ruff check --select I --fix .

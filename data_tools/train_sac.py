@@ -165,7 +165,7 @@ def _train_slice(folder: Path, settings: str, seed: int, n_decisions: int, n_eva
 
     state_dict = {name: tensor.numpy() for name, tensor in model.actor.state_dict().items()}
     weights = actor_weights(state_dict, offset, scale)
-    np.savez(folder / "policies" / f"{step:06d}.npz", **weights)
+    np.savez(folder / "policies" / f"{step:06d}.npz", **weights)  # type: ignore[arg-type]
     successes, returns = evaluate_actor(SacActor(weights), plain_env, n_eval_episodes)
     row = {
         "step": step,
