@@ -11,7 +11,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 DEVICE = "meta"
+WAITING = {"aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::is_nonzero", "aten::masked_select"}
 MAY_MIX = {"aten::copy_", "aten::_to_copy", "aten::index"}  # a GPU takes indices of the CPU too
+
+waits: list[str] = []  # what the CPU waited for the device's results in
 
 
 class DeviceTensor(th.Tensor):
@@ -58,6 +61,8 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     lands_there = bool(there) if asked is None else th.device(asked).type == DEVICE
     if name == "aten::copy_":
         lands_there = isinstance(args[0], DeviceTensor)
+    if there and (name in WAITING or not lands_there):
+        waits.append(name)
     if lands_there and asked is not None:
         kwargs = {**kwargs, "device": "cpu"}
     out = func(*tree_map(_held, args), **tree_map(_held, kwargs))

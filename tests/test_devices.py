@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
-from pretend_device import DEVICE, DeviceTensor, pretend
+from pretend_device import DEVICE, DeviceTensor, pretend, waits
 from test_algorithms import CASES, POLICIES, batch_of, files, make, needs_examples  # noqa: F401
 
 from sb3_offline import ALGOS
@@ -24,6 +24,11 @@ def test_an_algorithm_keeps_to_its_device(algo, policy, files, tmp_path, monkeyp
     with pretend(monkeypatch):
         model = make(algo, policy, files, device=DEVICE).learn(2, log_interval=1)
         assert all(isinstance(parameter, DeviceTensor) for parameter in model.policy.parameters())
+        waits.clear()
+        model.learn(3, log_interval=None, reset_num_timesteps=False)
+        assert len(waits) == (
+            3 if algo == "ceborl" else 0
+        ), waits  # CEBORL's policy batches are drawn by weights on the device
         actions, _ = model.predict(batch_of(POLICIES[policy]), deterministic=True)
         model.save(tmp_path / "model")
         kwargs = {"examples": files[policy][1]} if needs_examples(algo) else {}
