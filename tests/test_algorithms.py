@@ -208,6 +208,8 @@ def test_what_is_missing_or_wrong_is_named(files, tmp_path):
         ALGOS["bc"]("MlpPolicy", ForbiddenEnv(spaces.Box(-1, 1, (7,), np.float32)), dataset).learn(1)
     with pytest.raises(TypeError, match=r"backup is 'expert'.*dataset.*policy"):
         ALGOS["ceborl"]("MlpPolicy", None, dataset, examples, backup="expert")
+    with pytest.raises(TypeError, match=r"RCE: policy_random_shift .* leave it out"):
+        ALGOS["rce"]("MlpPolicy", None, dataset, examples, policy_random_shift=2)
 
 
 def test_vectors_are_standardised_by_the_dataset_and_stay_so_after_loading(files, tmp_path):

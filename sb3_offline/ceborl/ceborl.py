@@ -102,7 +102,7 @@ class CEBORL(ExampleBasedAlgorithm):
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
     :param policy_random_shift: the same for the images that the policy imitates, and for those alone (default:
-        ``random_shift``)
+        ``random_shift``), for ``policy_extraction="weighted"``
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -200,6 +200,9 @@ class CEBORL(ExampleBasedAlgorithm):
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise TypeError(f"{type(self).__name__}: {name} is {getattr(self, name)!r}; choose one of {choices}")
+        if policy_random_shift and policy_extraction == "maximize":
+            problem = "shifts the images that the policy imitates, but policy_extraction='maximize' imitates none; leave it out"
+            raise TypeError(f"{type(self).__name__}: policy_random_shift {problem}")
 
         if _init_setup_model:
             self._setup_model()
