@@ -79,7 +79,9 @@ def needs_examples(algo):
 def make(algo, policy, files, env=None, **kwargs):
     dataset, examples = files[policy]
     if needs_examples(algo):
-        kwargs = {"examples": examples, "example_batch_size": 4, **kwargs}
+        kwargs = {"examples": examples, **kwargs}
+        if algo != "dcql":
+            kwargs["example_batch_size"] = 4
     if algo == "oril":
         kwargs = {"reward_steps": 3, **kwargs}
     if policy != "MlpPolicy":
@@ -89,7 +91,7 @@ def make(algo, policy, files, env=None, **kwargs):
         small["features_extractor_kwargs"] = {"features_dim": 16}
     elif policy == "MultiInputPolicy":
         small["features_extractor_kwargs"] = {"cnn_output_dim": 16}
-    return ALGOS[algo](policy, env, dataset, batch_size=8, seed=3, policy_kwargs=small, **kwargs)
+    return ALGOS[algo](policy, env, dataset, **{"batch_size": 8, "seed": 3, "policy_kwargs": small, **kwargs})
 
 
 def batch_of(space, n=4):
@@ -337,3 +339,45 @@ def test_ceborl_variants_learn_and_log(kwargs, files):
         wanted |= {"penalty", "classifier_penalized"}
     assert wanted <= model._metrics.keys()
     assert all(np.isfinite(float(total)) for total, _ in model._metrics.values())
+
+
+@pytest.mark.parametrize(
+    ("algo", "kwargs", "problem"),
+    [
+        ("ceborl", {"weight_max": 0}, "weight_max is 0; give a number above 0"),
+        ("ceborl", {"beta": "high"}, "beta is 'high'; give a number of at least 0"),
+        ("ceborl", {"n_action_samples": 1, "mu": "mixture"}, "give n_action_samples >= 2"),
+        ("ceborl", {"random_shift": 2}, "random_shift shifts images, and there are none"),
+        ("bc", {"batch_size": 2.5}, "batch_size is 2.5; give a whole number of at least 1"),
+        ("cql", {"cql_alpha": "auto_nan"}, "cql_alpha is 'auto_nan'; give a number of at least 0, 'auto'"),
+        ("cql", {"ent_coef": "auto_0"}, "ent_coef is 'auto_0'"),
+        ("dcql", {"example_batch_size": 4}, "compares with all of the examples"),
+        ("iql", {"expectile": 1.5}, "expectile is 1.5; give a number between 0 and 1"),
+        ("oril", {"positive_prior": -1}, "positive_prior is -1; give a number between 0 and 1, or None"),
+        ("td3_bc", {"policy_delay": 0}, "policy_delay is 0; give a whole number of at least 1"),
+    ],
+)
+def test_hyperparameters_without_sense_are_refused(algo, kwargs, problem, files, tmp_path):
+    with pytest.raises(TypeError, match=problem):
+        make(algo, "MlpPolicy", files, **kwargs)
+    make(algo, "MlpPolicy", files).save(tmp_path / "model")
+    if not kwargs.keys() & {"ent_coef", "cql_alpha", "example_batch_size"}:  # those are of another kind, see below
+        with pytest.raises(TypeError, match=problem):
+            ALGOS[algo].load(tmp_path / "model", **kwargs)
+
+
+def test_a_loaded_model_has_the_coefficients_that_it_is_given(files, tmp_path):
+    make("cql", "MlpPolicy", files, cql_alpha=5.0, ent_coef=0.1).save(tmp_path / "fixed")
+    model = ALGOS["cql"].load(tmp_path / "fixed", cql_alpha=0.5)
+    assert model.log_cql_alpha.exp().item() == pytest.approx(0.5) and model.log_ent_coef.exp().item() == pytest.approx(0.1)
+    make("cql", "MlpPolicy", files, cql_alpha="auto_5.0").save(tmp_path / "learned")
+    assert ALGOS["cql"].load(tmp_path / "learned").log_cql_alpha.exp().item() == pytest.approx(5.0)
+    for name, alpha, was in (("fixed", "auto", "fixed"), ("learned", 0.5, "learned")):
+        with pytest.raises(TypeError, match=f"cql_alpha is {alpha!r}, and the saved model's was {was}"):
+            ALGOS["cql"].load(tmp_path / name, cql_alpha=alpha)
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_load_takes_the_policy_kwargs_of_the_constructor(algo, files, tmp_path):
+    make(algo, "MlpPolicy", files).save(tmp_path / "model")
+    ALGOS[algo].load(tmp_path / "model", policy_kwargs={"net_arch": [16, 16]})

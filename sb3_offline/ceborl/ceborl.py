@@ -1,7 +1,7 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 import math
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
@@ -18,6 +18,7 @@ from sb3_offline.ceborl.losses import (
 )
 from sb3_offline.ceborl.resampling import WeightedTransitions
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, OR_NONE, POSITIVE, SHARE, WHOLE
 from sb3_offline.common.losses import expectile_loss
 from sb3_offline.data.buffer import OfflineSamples, joined
 from sb3_offline.data.reader import DatasetSource
@@ -74,7 +75,7 @@ class CEBORL(ExampleBasedAlgorithm):
     :param gamma: the discount factor. What the classifier mistakes for success lives on in the odds by it: where attempts are
         short (50 steps in the shipped environment), try 0.95
     :param n_steps: omega is the mean of the 1-step and the n-step odds, discounted (1: the 1-step odds alone)
-    :param beta: weight of the conservative penalty (a)
+    :param beta: weight of the conservative penalty (a); with 0 the next three are not looked at
     :param n_action_samples: K, actions drawn from mu at each state
     :param mu: distribution of the penalised actions: ``"uniform"``, ``"policy"``, or ``"mixture"`` (half of each)
     :param penalty_space: penalise the ``"probability"`` C or the ``"logit"``
@@ -89,7 +90,7 @@ class CEBORL(ExampleBasedAlgorithm):
         action, but a state's odds as an upper expectile of the logits of the data's actions in it, as in IQL
     :param expectile: of ``backup="expectile"``: 0.5 is the mean, near 1 the best of the data's actions
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
-        paper's Eq. 11
+        paper's Eq. 11. The next six are of ``"weighted"``
     :param advantage: what the weights compare with the state's odds: ``"return"``: omega, to which the data's actions led
         within the n-step window; ``"value"``: what the classifier says of the data's action
     :param temperature: of the advantage weights: the power 1 / temperature of the odds' ratio
@@ -112,6 +113,23 @@ class CEBORL(ExampleBasedAlgorithm):
     :param device: Device (cpu, cuda, ...) on which the code should be run.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
+
+    numbers: ClassVar[dict[str, str]] = {
+        "beta": NOT_NEGATIVE,
+        "n_action_samples": COUNT,
+        "omega_max": POSITIVE,
+        "class_prior": POSITIVE,
+        "example_share": SHARE,
+        "initial_odds": POSITIVE,
+        "expectile": SHARE,
+        "temperature": POSITIVE,
+        "advantage_floor": POSITIVE,
+        "weight_max": POSITIVE,
+        "state_exponent": NOT_NEGATIVE,
+        "policy_batches": COUNT,
+        "ent_coef": NOT_NEGATIVE,
+        "policy_random_shift": WHOLE + OR_NONE,
+    }
 
     def __init__(
         self,
@@ -197,24 +215,31 @@ class CEBORL(ExampleBasedAlgorithm):
         self._weighted_transitions = WeightedTransitions(policy_batches)
         self._dataset_checksum: int | None = None
         self.ent_coef = ent_coef
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise TypeError(f"{type(self).__name__}: {name} is {getattr(self, name)!r}; choose one of {choices}")
-        if policy_random_shift and policy_extraction == "maximize":
-            problem = "shifts the images that the policy imitates, but policy_extraction='maximize' imitates none; leave it out"
-            raise TypeError(f"{type(self).__name__}: policy_random_shift {problem}")
 
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise TypeError(f"{type(self).__name__}: {name} is {getattr(self, name)!r}; choose one of {choices}")
+        if self.policy_random_shift and self.policy_extraction == "maximize":
+            problem = (
+                "shifts the images that the policy imitates, but policy_extraction='maximize' imitates none; leave it out"
+            )
+            raise TypeError(f"{type(self).__name__}: policy_random_shift {problem}")
+        if self.mu == "mixture" and self.n_action_samples == 1:
+            raise TypeError(f"{type(self).__name__}: mu='mixture' takes half of the actions each; give n_action_samples >= 2")
         self.needs_next_actions = self.backup != "policy"
-        self.policy_kwargs.setdefault("critic_output_bias", math.log(self.initial_odds))
-        if self.policy_extraction == "weighted" or self.backup == "expectile":
-            self.policy_kwargs.setdefault("critic_state_value", True)
-        if self.policy_extraction == "weighted":
-            self.policy_kwargs.setdefault("std_min", 0.05)
         super()._setup_model()
+
+    def all_policy_kwargs(self) -> dict[str, Any]:
+        own: dict[str, Any] = {"critic_output_bias": math.log(self.initial_odds)}
+        if self.policy_extraction == "weighted" or self.backup == "expectile":
+            own["critic_state_value"] = True
+        if self.policy_extraction == "weighted":
+            own["std_min"] = 0.05
+        return {**own, **self.policy_kwargs}
 
     def _open_data(self) -> None:
         super()._open_data()

@@ -13,11 +13,12 @@ GROUP_SIZE = 32
 
 def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) -> th.Tensor:
     """
-    Shift each image by up to ``max_shift`` pixels in both directions, repeating its edge.
+    Shift images by up to ``max_shift`` pixels in both directions, repeating their edges. Images share a shift in groups of
+    ``GROUP_SIZE``: those of a batch of 32 are all shifted alike.
 
     :param images: ``(batch, channels, height, width)``, any dtype
     :param max_shift: largest shift in pixels; 0 returns the images as they are
-    :param rng: source of the offsets; ``GROUP_SIZE`` consecutive images share one
+    :param rng: source of the offsets
     :return: a tensor like ``images``
     """
     if max_shift == 0:
@@ -46,6 +47,16 @@ def _repeat_edges(images: th.Tensor, filled: slice, dim: int) -> None:
     for first, count, line in ((0, filled.start, filled.start), (filled.stop, size - filled.stop, filled.stop - 1)):
         if count:
             images.narrow(dim, first, count).copy_(images.narrow(dim, line, 1))
+
+
+def has_images(space: spaces.Space, float_images: bool = False) -> bool:
+    """
+    :param space: of observations
+    :param float_images: see :func:`shift_observations`
+    :return: whether there is anything in them to shift
+    """
+    parts = space.values() if isinstance(space, spaces.Dict) else [space]
+    return any(is_image_space(part, normalized_image=float_images) for part in parts)
 
 
 def shift_observations(

@@ -1,7 +1,7 @@
 """What algorithms share that learn from examples of success instead of rewards."""
 
 from os import PathLike
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -10,6 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
+from sb3_offline.common.hyperparameters import COUNT
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import DatasetSource
 
@@ -29,6 +30,8 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
     :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     """
 
+    numbers: ClassVar[dict[str, str]] = {"example_batch_size": COUNT}
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -38,12 +41,12 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         example_batch_size: int = 256,
         **kwargs: Any,
     ):
-        super().__init__(policy, env, dataset, **kwargs)
         # Plain attributes for the same reason as `dataset`: `load(path, examples=...)` replaces them.
         self.examples = examples
         self.example_batch_size = example_batch_size
         self._example_arrays: dict[str, np.ndarray] | None = None
         self._example_source: ExampleSource | None = None
+        super().__init__(policy, env, dataset, **kwargs)
 
     def all_examples(self) -> PyTorchObs:
         """

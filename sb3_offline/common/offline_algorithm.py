@@ -18,7 +18,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
-from sb3_offline.common.augmentation import shift_observations
+from sb3_offline.common.augmentation import has_images, shift_observations
+from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, check_numbers
 from sb3_offline.common.process import prepare_process
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer
@@ -59,6 +60,15 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
     #: whether ``train()`` needs the dataset's action at the next step (an episode's last step is then its own successor)
     needs_next_actions: bool = False
+    #: what the constructor's numbers are to be; a subclass names its own
+    numbers: ClassVar[dict[str, str]] = {
+        "batch_size": COUNT,
+        "tau": SHARE,
+        "gamma": SHARE,
+        "n_steps": COUNT,
+        "target_update_interval": COUNT,
+        "random_shift": WHOLE,
+    }
     _replay_buffer: Any
     _opened_sources: tuple[Any, ...]
 
@@ -93,7 +103,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             tau=tau,
             gamma=gamma,
             n_steps=n_steps,
-            policy_kwargs=dict(policy_kwargs or {}),  # algorithms add their defaults to it
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -122,14 +132,26 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
             raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
+        for cls in type(self).__mro__:
+            check_numbers(self, vars(cls).get("numbers", {}))
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)  # a loaded model keeps the states of its generators
         if self.env is None:
             self.env = self._wrap_env(SpacesOnlyEnv(self.observation_space, self.action_space))
-        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        policy_kwargs = self.all_policy_kwargs()
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **policy_kwargs)
         self.policy = self.policy.to(self.device)
+        if self.random_shift and not has_images(self.observation_space, not self.policy.normalize_images):
+            problem = f"{type(self).__name__}: random_shift shifts images, and there are none in {self.observation_space}"
+            raise TypeError(f"{problem}; leave it out")
         self._convert_train_freq()
         self._create_aliases()
+
+    def all_policy_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the user's ``policy_kwargs``, and the algorithm's own where they say nothing
+        """
+        return self.policy_kwargs
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor  # type: ignore[assignment]

@@ -53,7 +53,7 @@ def export_sac(
     if not 0 <= data_ratio <= 1:
         raise ValueError(f"data_ratio is {data_ratio}; give a share between 0 and 1")
     keeps_critic = isinstance(model, RewardBasedAlgorithm)
-    policy_kwargs = {k: v for k, v in model.policy_kwargs.items() if k != "critic_state_value"}
+    policy_kwargs = {k: v for k, v in model.all_policy_kwargs().items() if k != "critic_state_value"}
     if not keeps_critic:
         policy_kwargs.pop("critic_output_bias", None)
     arguments = {name: getattr(model, name) for name in ("learning_rate", "batch_size", "tau", "gamma", "device")}

@@ -1,12 +1,13 @@
 """CQL: Conservative Q-Learning."""
 
 import math
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
+from sb3_offline.common.hyperparameters import COUNT
 from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.cql.losses import conservative_gaps
@@ -56,6 +57,7 @@ class CQL(RewardBasedAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
+    numbers: ClassVar[dict[str, str]] = {"n_action_samples": COUNT}
     log_ent_coef: th.Tensor
     log_cql_alpha: th.Tensor
     ent_coef_optimizer: th.optim.Adam | None
@@ -132,9 +134,10 @@ class CQL(RewardBasedAlgorithm):
             number = str(setting).removeprefix("auto").removeprefix("_") or 1.0
         try:
             number = float(number)
-            if number < 0:
-                raise ValueError(f"{number} is negative")
-        except ValueError as error:
+            # A learned one that starts at 0 would stay there: it is the exponential of what is learned
+            if not math.isfinite(number) or number < 0 or (learned and number == 0):
+                raise ValueError(f"{number} is out of bounds")
+        except (TypeError, ValueError) as error:
             problem = f"{type(self).__name__}: {name} is {setting!r}; give a number of at least 0, 'auto' or 'auto_0.1'"
             raise TypeError(problem) from error
         log = th.tensor([number], device=self.device).log()
@@ -222,4 +225,14 @@ class CQL(RewardBasedAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         learned = [name for name in ("ent_coef", "cql_alpha") if getattr(self, f"{name}_optimizer") is not None]
-        return [*state_dicts, *(f"{name}_optimizer" for name in learned)], [*variables, "log_ent_coef", "log_cql_alpha"]
+        # A fixed one is an attribute, which `load` may replace
+        return [*state_dicts, *(f"{name}_optimizer" for name in learned)], [*variables, *(f"log_{name}" for name in learned)]
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        if isinstance(load_path_or_dict, dict) and exact_match:
+            for name in ("ent_coef", "cql_alpha"):
+                was, optimizer = f"{name}_optimizer" in load_path_or_dict, getattr(self, f"{name}_optimizer")
+                if was == (optimizer is None):
+                    problem = f"{name} is {getattr(self, name)!r}, and the saved model's was {'learned' if was else 'fixed'}"
+                    raise TypeError(f"{type(self).__name__}: {problem}; leave it so, or train a new model")
+        super().set_parameters(load_path_or_dict, exact_match, device)

@@ -1,12 +1,13 @@
 """d-CQL: CQL on the distance to goals."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.hyperparameters import POSITIVE
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.reader import DatasetSource
@@ -34,6 +35,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
     :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
     """
 
+    numbers: ClassVar[dict[str, str]] = {"reward_scale": POSITIVE}
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -49,6 +52,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
     ):
         if "reward_fn" in kwargs:
             raise TypeError("DCQL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
+        if "example_batch_size" in kwargs:
+            raise TypeError("DCQL compares with all of the examples, so it has no example_batch_size; leave it out")
         if distance not in ("l2", "mse"):
             raise TypeError(f"DCQL: distance is {distance!r}; choose 'l2' or 'mse'")
         self.distance = distance

@@ -1,11 +1,12 @@
 """IQL: Implicit Q-Learning."""
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE
 from sb3_offline.common.losses import bellman_loss, effective_share, expectile_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.data.reader import DatasetSource
@@ -45,6 +46,8 @@ class IQL(RewardBasedAlgorithm):
     :param device: Device (cpu, cuda, ...) on which the code should be run.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
+
+    numbers: ClassVar[dict[str, str]] = {"expectile": SHARE, "inverse_temperature": NOT_NEGATIVE, "weight_max": POSITIVE}
 
     def __init__(
         self,
@@ -98,10 +101,8 @@ class IQL(RewardBasedAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_model(self) -> None:
-        self.policy_kwargs.setdefault("critic_state_value", True)
-        self.policy_kwargs.setdefault("std_min", 0.05)
-        super()._setup_model()
+    def all_policy_kwargs(self) -> dict[str, Any]:
+        return {"critic_state_value": True, "std_min": 0.05, **self.policy_kwargs}
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)

@@ -1,12 +1,13 @@
 """ORIL: Offline Reinforced Imitation Learning, from examples of success."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.hyperparameters import OR_NONE, POSITIVE, SHARE, WHOLE
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.reader import DatasetSource
@@ -39,6 +40,11 @@ class ORIL(ExampleBasedAlgorithm, CQL):
     :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
     """
 
+    numbers: ClassVar[dict[str, str]] = {
+        "reward_steps": WHOLE,
+        "reward_learning_rate": POSITIVE,
+        "positive_prior": SHARE + OR_NONE,
+    }
     reward_model: RewardClassifier
 
     def __init__(

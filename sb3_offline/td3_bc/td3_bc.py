@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
+from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE
 from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.data.reader import DatasetSource
@@ -51,6 +52,12 @@ class TD3BC(RewardBasedAlgorithm):
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
+    }
+    numbers: ClassVar[dict[str, str]] = {
+        "alpha": NOT_NEGATIVE,
+        "policy_delay": COUNT,
+        "target_policy_noise": NOT_NEGATIVE,
+        "target_noise_clip": NOT_NEGATIVE,
     }
     policy: TD3BCPolicy
     actor: DeterministicActor  # type: ignore[assignment]
