@@ -84,7 +84,11 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     train[train.index("--examples") + 1] = "typo.h5"
     with pytest.raises(SystemExit, match=r"typo\.h5"):
         cli.main([*train, "--eval-freq", "1", "-o", run])
-    assert files() == before  # a run stays until the data of the next one are found good
+    train[train.index("typo.h5")] = str(tmp_path / "examples.h5")
+    for wrong, message in ((["--env", "Pendulum-v1"], "do not fit"), (["--hyperparams", "weight_max:0"], "weight_max is 0")):
+        with pytest.raises(SystemExit, match=message):
+            cli.main([*train, "--eval-freq", "1", "-o", run, *wrong])
+    assert files() == before  # a run stays until the data, the numbers and the environment of the next one are found good
     config = tmp_path / "run/config.yml"
     config.write_text(config.read_text().replace("env: MultimodalMetaworld-v0", "env: Gone-v0"))
     with pytest.raises(SystemExit, match="Gone"):
@@ -119,6 +123,11 @@ def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "short.yml"], "short.yml: .*lacks n_timesteps"),
         (["train", "--dataset", "x.h5", "-o", "run", "--config", "broken.yml"], "broken.yml: is not YAML"),
         (["train", "--dataset", "x.h5", "-o", "run", "--env", "No-v0", "--eval-freq", "1"], "no environment 'No-v0'"),
+        (["train", "--algo", "bc", "--dataset", "x.h5", "-o", "run", "--eval-freq", "1"], "several tasks.*--task"),
+        (
+            ["train", "--dataset", "x.h5", "-o", "run", "--config", "code.yml"],
+            "code.yml: policy_kwargs of Mul.*nn.ReLU.*literal",
+        ),
         (["train", "--algo", "bc", "--dataset", "x.h5", "-o", "run", "-n", "0"], "n_timesteps is 0"),
         (["train", "--algo", "bc", "--dataset", "x.h5", "-o", "run", "--eval-episodes", "0"], "n_eval_episodes is 0"),
         (["train", "--dataset", "x.h5", "-o", "run", "--env", "no_module:No-v0", "--eval-freq", "1"], "no_module"),
@@ -130,7 +139,9 @@ def test_every_algorithm_trains_with_its_config(algo, demo, tmp_path):
 )
 def test_mistakes_end_in_one_line(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name, text in {"list": "- 1", "short": "default: {policy: MlpPolicy}", "broken": "a: ["}.items():
+    code = "default: {policy: MlpPolicy, n_timesteps: 1, policy_kwargs: 'dict(activation_fn=nn.ReLU)', env_kwargs: }"
+    texts = {"list": "- 1", "short": "default: {policy: MlpPolicy}", "broken": "a: [", "code": code}
+    for name, text in texts.items():
         (tmp_path / f"{name}.yml").write_text(text)
     with pytest.raises(SystemExit, match=f"(?s)sb3-offline: .*{message}"):
         cli.main(arguments)

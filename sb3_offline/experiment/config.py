@@ -64,6 +64,12 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
     config = dict(section)
     if isinstance(config.get("policy_kwargs"), str):  # files of the RL Zoo write Python: "dict(net_arch=[64, 64])"
         config["policy_kwargs"] = python_value(config["policy_kwargs"])
+    for name in ("policy_kwargs", "env_kwargs"):
+        if config.get(name) is None:
+            config.pop(name, None)
+        elif not isinstance(config[name], dict):
+            remedy = "write its entries below it, indented, or dict(name=literal)"
+            raise RuntimeError(f"{path}: {name} of {env_id} is {config[name]!r}; {remedy}")
     return config
 
 

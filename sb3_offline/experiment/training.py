@@ -21,8 +21,9 @@ from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
 from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.envs import ENV_ID
 from sb3_offline.experiment.data import resolve_data
-from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success
+from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success, make_evaluation_env
 
 EVALUATION_FIELDS = ("step", "episodes", "successes", "mean_return")
 RESUME_FILE = "resume.zip"
@@ -265,10 +266,12 @@ def train(
     all_callbacks = list(callbacks)
     counts = {"n_timesteps": config["n_timesteps"], "n_eval_episodes": n_eval_episodes}
     for name, count in counts.items():
-        if count < 1:
-            raise RuntimeError(f"{name} is {count}; give at least 1")
+        if not isinstance(count, int | float) or count < 1:
+            raise RuntimeError(f"{name} is {count!r}; give a number of at least 1")
     if eval_freq > 0:
         _check_registered(env_id)
+        if env_id == ENV_ID and "task" not in config["env_kwargs"]:
+            raise RuntimeError(f"{env_id} has several tasks; say which one to evaluate: --task, or `task` in env_kwargs")
         table = output / "evaluations.csv"
         all_callbacks.append(EvaluationTable(table, env_id, config["env_kwargs"], eval_freq, n_eval_episodes, verbose=verbose))
     resume_file, model = output / RESUME_FILE, None
@@ -279,6 +282,8 @@ def train(
             model = None  # other evaluations were asked for than that run made
     if model is None:
         model = create_model(algo, config, dataset, examples, seed, verbose=verbose)
+        if eval_freq > 0:
+            _check_playable(model, env_id, config["env_kwargs"])
         all_callbacks.insert(0, _ReplaceEarlierRun(output, record))
     if isinstance(model, CEBORL):
         all_callbacks.append(DiagnosticsCallback())
@@ -328,6 +333,19 @@ def _check_registered(env_id: str) -> None:
         gym.spec(name)
     except (gym.error.Error, ImportError) as error:
         raise RuntimeError(f"There is no environment {env_id!r} to evaluate in: {error}") from error
+
+
+def _check_playable(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any]) -> None:
+    """Raise where a model and the environment to evaluate it in do not fit, before the model learns anything."""
+    try:
+        env = make_evaluation_env(env_id, env_kwargs, seed=0)
+        try:
+            env.step(model.predict(env.reset(), deterministic=True)[0])  # type: ignore[arg-type]
+        finally:
+            env.close()
+    except (TypeError, ValueError) as error:
+        remedy = "evaluate where the data are from: --env, --task and env_kwargs"
+        raise RuntimeError(f"{env_id} and what is learned from do not fit: {error}; {remedy}") from error
 
 
 def is_finished(output: Path, arguments: dict[str, Any]) -> bool:
