@@ -178,6 +178,21 @@ def test_d4rl_file_without_next_observations(tmp_path):
     assert np.flatnonzero(dataset.truncated).tolist() == [6, 7]
 
 
+def test_d4rl_file_without_timeouts(tmp_path):
+    arrays = d4rl_arrays()
+    del arrays["timeouts"]
+    write_arrays(tmp_path / "d.hdf5", arrays)
+    with pytest.warns(UserWarning, match=r"timeouts: are missing.*max_episode_steps"):
+        assert OfflineDataset(tmp_path / "d.hdf5").lengths.tolist() == [4, 5]
+    assert OfflineDataset(tmp_path / "d.hdf5", max_episode_steps=4).lengths.tolist() == [4, 3, 1]
+    arrays["next_observations"] = arrays["observations"] + 1
+    arrays["next_observations"][6] = 100  # the next row is of another episode
+    write_arrays(tmp_path / "n.hdf5", arrays)
+    dataset = OfflineDataset(tmp_path / "n.hdf5")
+    assert dataset.lengths.tolist() == [4, 3, 3] and np.flatnonzero(dataset.truncated).tolist() == [6, 9]
+    assert dataset.observations[[8, 9], 0].tolist() == [100, 7]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

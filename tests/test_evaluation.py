@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from test_algorithms import ACTIONS, POLICIES, files, make  # noqa: F401
 
 from sb3_offline import BC, CQL, IQL
+from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.evaluation import OfflineEvalCallback, fitted_q_evaluation
@@ -53,6 +54,18 @@ def test_fitted_q_evaluation_gives_the_exact_value(tmp_path, goes_right, exact):
     np.testing.assert_allclose(values, exact, atol=0.5)
     assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
     assert th.equal(th.get_rng_state(), state)
+
+
+def test_what_followed_an_episodes_last_step_counts(files):  # noqa: F811
+    model = make("ceborl", "MlpPolicy", files)
+    own, callback = model.replay_buffer, OfflineEvalCallback()
+    callback.init_callback(model)
+    callback._on_training_start()
+    plain = OfflineReplayBuffer(files["MlpPolicy"][0], own.observation_space, own.action_space)
+    last = np.cumsum(own.datasets[0].lengths) - 1
+    following = callback.buffer.transitions(last).next_observations
+    assert th.equal(following, plain.transitions(last).next_observations)
+    assert th.equal(own.transitions(last).next_observations, own.transitions(last).observations)  # CEBORL's own convention
 
 
 def test_a_run_is_the_same_with_and_without_and_logs_what_applies(files, tmp_path):  # noqa: F811

@@ -267,6 +267,12 @@ def test_oril_rewards_tell_examples_apart_and_come_back_with_the_model(positive_
     loaded = ORIL.load(tmp_path / "model")  # no examples: the classifier is kept, not trained again
     loaded.learn(1, reset_num_timesteps=False)
     np.testing.assert_array_equal(loaded.replay_buffer.rewards, buffer.rewards)
+    ORIL.load(tmp_path / "model", examples=examples, reward_steps=model.reward_steps)
+    for name, value in (("examples", examples + 1), ("reward_steps", 7)):
+        with pytest.raises(TypeError, match=f"ORIL: {name} of .*model cannot be replaced"):
+            ORIL.load(tmp_path / "model", **{name: value})
+    with pytest.raises(DatasetError, match=r"nowhere\.h5"):
+        ORIL.load(tmp_path / "model", examples="nowhere.h5")
 
 
 def test_oril_shifts_images_of_both_kinds_alike(folder, monkeypatch):

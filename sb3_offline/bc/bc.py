@@ -23,7 +23,7 @@ class BC(OfflineAlgorithm):
     :param batch_size: Transitions in a batch
     :param loss: ``"mse"``: squared error of the policy's mode (its standard deviation is fitted by likelihood), or
         ``"log_prob"``: likelihood of both
-    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
+    :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)

@@ -101,7 +101,7 @@ class CEBORL(ExampleBasedAlgorithm):
     :param policy_batches: the policy learns from the transitions of the last so many batches, drawn by their weights
     :param ent_coef: Entropy coefficient, for ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
-    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
+    :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
     :param policy_random_shift: the same for the images that the policy imitates, and for those alone (default:
         ``random_shift``), for ``policy_extraction="weighted"``
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``

@@ -1,7 +1,7 @@
 """What numbers the constructors of the algorithms take."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -12,9 +12,9 @@ NOT_NEGATIVE = "a number of at least 0"
 SHARE = "a number between 0 and 1"
 OR_NONE = ", or None"
 
-_FITS = {
-    COUNT: lambda value: isinstance(value, Integral) and value >= 1,
-    WHOLE: lambda value: isinstance(value, Integral) and value >= 0,
+_FITS: dict[str, Callable[[Any], bool]] = {
+    COUNT: lambda value: isinstance(value, Integral) and int(value) >= 1,
+    WHOLE: lambda value: isinstance(value, Integral) and int(value) >= 0,
     POSITIVE: lambda value: value > 0,
     NOT_NEGATIVE: lambda value: value >= 0 and math.isfinite(value),
     SHARE: lambda value: 0 <= value <= 1,

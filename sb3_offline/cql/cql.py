@@ -46,7 +46,7 @@ class CQL(RewardBasedAlgorithm):
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param reward_fn: rewards in place of the dataset's, see
         :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
-    :param random_shift: images are shifted by up to so many pixels (0: no augmentation)
+    :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)

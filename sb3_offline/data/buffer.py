@@ -197,6 +197,15 @@ class OfflineReplayBuffer(ReplayBuffer):
             samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
         return samples._replace(**self._windows(steps, rows, env)) if self.n_steps > 1 else samples
 
+    def single_steps(self) -> "OfflineReplayBuffer":
+        """
+        :return: a buffer over the same arrays without windows and next actions: what followed an episode's last step is there
+        """
+        other = object.__new__(type(self))  # a copy would read the files again
+        other.__dict__.update(self.__dict__, n_steps=1, next_actions=False)
+        other._index_steps(np.concatenate([dataset.lengths for dataset in self.datasets]))
+        return other
+
     def pairs(self, steps: np.ndarray, env: VecNormalize | None = None) -> tuple[Observations, th.Tensor]:
         """
         :param steps: (B,) step numbers, as for :meth:`transitions`

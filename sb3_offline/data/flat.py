@@ -62,6 +62,29 @@ def cut_episodes(
     return arrays
 
 
+def follows(observations: Mapping[str, np.ndarray], following: Mapping[str, np.ndarray]) -> np.ndarray:
+    """
+    :param observations: (n, ...) by array name
+    :param following: what followed each step, likewise
+    :return: (n,) whether that is the next row's observation; false in the last row
+    """
+    same = np.ones(len(next(iter(observations.values()))), dtype=bool)
+    same[-1] = False
+    for name, array in observations.items():
+        same[:-1] &= (array[1:] == following[name][:-1]).reshape(len(array) - 1, -1).all(axis=1)
+    return same
+
+
+def lengths_so_far(ends: np.ndarray) -> np.ndarray:
+    """
+    :param ends: (n,) whether a step is the last one of its episode
+    :return: (n,) number of steps of the episode up to and with each row
+    """
+    index = np.arange(len(ends))
+    starts = np.maximum.accumulate(np.where(np.append(True, ends[:-1]), index, 0))
+    return index - starts + 1
+
+
 def checked_observations(arrays: Mapping[str, np.ndarray], space: spaces.Space, path: str | os.PathLike) -> dict[str, Any]:
     """
     :param arrays: observations by array name, ``observations`` or ``observations/key``

@@ -82,7 +82,8 @@ class OfflineDataset:
     :param observation_space: space of D4RL-style files and of rollouts, which declare none (default: unbounded, from the data)
     :param action_space: likewise (default: [-1, 1])
     :param max_episode_steps: time limit of the environment, for rollouts of `imitation` and for replay buffers without
-        ``handle_timeout_termination``, which call every end of an episode terminal
+        ``handle_timeout_termination``, which call every end of an episode terminal, and for D4RL-style files without
+        ``timeouts``
     :param episodes: numbers of the episodes to hold, as if the file had no others; they are read into memory
     """
 
@@ -108,7 +109,7 @@ class OfflineDataset:
             header, arrays, self._declares_spaces = foreign
             n_episodes = len(arrays["episodes/length"])
         else:
-            header, arrays, n_episodes = self._read_hdf5(observation_space, action_space)
+            header, arrays, n_episodes = self._read_hdf5(observation_space, action_space, max_episode_steps)
         if episodes is not None:
             numbers = self._options["episodes"] = _episode_numbers(episodes, n_episodes, self.path)
             arrays = _chosen_rows(arrays, numbers)
@@ -149,12 +150,12 @@ class OfflineDataset:
         return OfflineDataset(self.path, **{**self._options, "episodes": numbers})
 
     def _read_hdf5(
-        self, observation_space: spaces.Space | None, action_space: spaces.Space | None
+        self, observation_space: spaces.Space | None, action_space: spaces.Space | None, max_episode_steps: int | None
     ) -> tuple[Header, dict[str, Any], int]:
         with open_hdf5(self.path) as file:
             self._declares_spaces = not is_d4rl(file)
             if not self._declares_spaces:
-                header, arrays = read_d4rl(file, self.path, observation_space, action_space)
+                header, arrays = read_d4rl(file, self.path, observation_space, action_space, max_episode_steps)
                 return header, arrays, len(arrays["episodes/length"])
             header = read_header(file, self.path)
             n_episodes, arrays = self._read_arrays(file, header)

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.flat import cut_episodes
+from sb3_offline.data.flat import cut_episodes, follows, lengths_so_far
 from sb3_offline.data.format import Header
 from sb3_offline.data.spaces import subspaces
 
@@ -65,11 +65,11 @@ def read_replay_buffer(path: Path, max_episode_steps: int | None = None) -> tupl
     else:
         following = columns(buffer.next_observations, rows)
         # Also where the environment was reset without being done, as each `learn` does
-        broken = newest | ~_follows(observations, following)
+        broken = newest | ~follows(observations, following)
     timeouts = rows(buffer.timeouts).astype(bool)
     ends = dones | broken
     if not buffer.handle_timeout_termination and max_episode_steps:
-        timeouts |= dones & (_lengths_so_far(ends) == max_episode_steps)
+        timeouts |= dones & (lengths_so_far(ends) == max_episode_steps)
     steps = {
         "actions": _unscaled(rows(buffer.actions), buffer.action_space, path),
         "rewards": rows(buffer.rewards),
@@ -95,22 +95,6 @@ def _unpickle(path: Path) -> ReplayBuffer:
         problem = f"holds a {type(buffer).__module__}.{type(buffer).__name__}, no ReplayBuffer of Stable-Baselines3"
         raise DatasetError(path, "file", problem, "Give what model.save_replay_buffer wrote")
     return buffer
-
-
-def _follows(observations: dict[str, np.ndarray], following: dict[str, np.ndarray]) -> np.ndarray:
-    """:return: (n,) whether the observation after each step is that of the next row; false in the last row"""
-    same = np.ones(len(next(iter(observations.values()))), dtype=bool)
-    same[-1] = False
-    for name, array in observations.items():
-        same[:-1] &= (array[1:] == following[name][:-1]).reshape(len(array) - 1, -1).all(axis=1)
-    return same
-
-
-def _lengths_so_far(ends: np.ndarray) -> np.ndarray:
-    """:return: (n,) number of steps of the episode up to and with each row"""
-    index = np.arange(len(ends))
-    starts = np.maximum.accumulate(np.where(np.append(True, ends[:-1]), index, 0))
-    return index - starts + 1
 
 
 def _unscaled(actions: np.ndarray, space: spaces.Space, path: os.PathLike) -> np.ndarray:

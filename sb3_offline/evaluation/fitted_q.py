@@ -45,7 +45,7 @@ def fitted_q_evaluation(
     :param seed: of weights, batches and sampled actions
     :return: (E,) the values of the episodes' first states; their mean estimates the policy's discounted return
     """
-    buffer = model.replay_buffer if buffer is None else buffer
+    buffer = (model.replay_buffer if buffer is None else buffer).single_steps()
     if not buffer.has_rewards:
         remedy = "Evaluate on a dataset with rewards"
         raise DatasetError(buffer.datasets[0].path, "rewards", "are missing, so a policy has no value", remedy)

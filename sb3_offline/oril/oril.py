@@ -1,5 +1,6 @@
 """ORIL: Offline Reinforced Imitation Learning, from examples of success."""
 
+import zlib
 from typing import Any, ClassVar
 
 import torch as th
@@ -10,6 +11,7 @@ from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSourc
 from sb3_offline.common.hyperparameters import OR_NONE, POSITIVE, SHARE, WHOLE
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.oril.losses import classifier_loss
 from sb3_offline.oril.reward_model import RewardClassifier
@@ -67,6 +69,7 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         self.reward_steps = reward_steps
         self.reward_learning_rate = reward_learning_rate
         self.positive_prior = positive_prior
+        self._trained_with: dict[str, Any] | None = None
         super().__init__(
             policy,
             env,
@@ -114,6 +117,31 @@ class ORIL(ExampleBasedAlgorithm, CQL):
                 reward_data=data_logits.sigmoid().mean(),
             )
         model.trained.fill_(1.0)
+        self._trained_with = self._training_settings()
+
+    def _training_settings(self) -> dict[str, Any]:
+        """:return: all that the classifier is made of, beside the dataset"""
+        loaded = load_examples(self.examples, self.observation_space)  # type: ignore[arg-type]
+        checksum = 0
+        for array in loaded.values() if isinstance(loaded, dict) else [loaded]:
+            checksum = zlib.crc32(array.tobytes(), checksum)
+        return {"examples": checksum, **{name: getattr(self, name) for name in ("example_batch_size", *self.numbers)}}
+
+    @classmethod
+    def load(cls, path: Any, *args: Any, **kwargs: Any) -> "ORIL":  # type: ignore[override]
+        """
+        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. Examples, and settings of the classifier, may
+        be given again, but no others than it was trained with.
+        """
+        model = super().load(path, *args, **kwargs)
+        given = {name for name in ("examples", "example_batch_size", *cls.numbers) if kwargs.get(name) is not None}
+        if given and model._trained_with is not None:
+            settings = model._training_settings() if "examples" in given else {name: kwargs[name] for name in given}
+            others = sorted(name for name in given if settings[name] != model._trained_with[name])
+            if others:
+                problem = f"{', '.join(others)} of {path} cannot be replaced: its classifier is trained, and the rewards stay"
+                raise TypeError(f"ORIL: {problem}; make a new model")
+        return model
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
