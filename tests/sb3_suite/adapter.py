@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline import DCQL, OfflineAlgorithm
+from sb3_offline import OfflineAlgorithm
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.spaces import space_to_json
 from sb3_offline.data.writer import DatasetWriter
@@ -33,14 +33,16 @@ def in_place_of_sac(algorithm: type[OfflineAlgorithm]) -> type[OfflineAlgorithm]
         if "kwargs" not in parameters:
             break  # what it does not name, it does not take
 
+    if algorithm.__name__ == "DCQL":
+        known.remove("example_batch_size")  # it compares with all examples
+
     class InPlaceOfSAC(algorithm):  # type: ignore[valid-type, misc]
         def __init__(
             self, policy: Any, env: Any = None, learning_rate: Any = 3e-4, _init_setup_model: bool = True, **kwargs: Any
         ):
             kept = {name: value for name, value in kwargs.items() if name in known and not isinstance(value, str | tuple)}
             kept |= {name: kwargs[name] for name in ("device", "tensorboard_log") if name in kwargs}
-            small = {name: value for name, value in SMALL.items() if name != "example_batch_size" or algorithm is not DCQL}
-            kept |= {name: value for name, value in small.items() if name in known and name not in kept}
+            kept |= {name: value for name, value in SMALL.items() if name in known and name not in kept}
             super().__init__(policy, env, learning_rate=learning_rate, _init_setup_model=False, **kept)
             if _init_setup_model:
                 self._setup_model()
