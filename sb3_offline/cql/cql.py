@@ -1,10 +1,11 @@
 """CQL: Conservative Q-Learning."""
 
 import math
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
 from sb3_offline.common.hyperparameters import COUNT
@@ -12,6 +13,8 @@ from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.cql.losses import conservative_gaps
 from sb3_offline.data.reader import DatasetSource
+
+SelfCQL = TypeVar("SelfCQL", bound="CQL")
 
 #: Bound of a learned ``cql_alpha``.
 ALPHA_MAX = 1e6
@@ -228,11 +231,15 @@ class CQL(RewardBasedAlgorithm):
         # A fixed one is an attribute, which `load` may replace
         return [*state_dicts, *(f"{name}_optimizer" for name in learned)], [*variables, *(f"log_{name}" for name in learned)]
 
-    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
-        if isinstance(load_path_or_dict, dict) and exact_match:
-            for name in ("ent_coef", "cql_alpha"):
-                was, optimizer = f"{name}_optimizer" in load_path_or_dict, getattr(self, f"{name}_optimizer")
-                if was == (optimizer is None):
-                    problem = f"{name} is {getattr(self, name)!r}, and the saved model's was {'learned' if was else 'fixed'}"
-                    raise TypeError(f"{type(self).__name__}: {problem}; leave it so, or train a new model")
-        super().set_parameters(load_path_or_dict, exact_match, device)
+    @classmethod
+    def load(cls: type[SelfCQL], path: Any, *args: Any, **kwargs: Any) -> SelfCQL:  # type: ignore[override]
+        """
+        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. Fixed coefficients stay fixed, and learned ones
+        learned, from where they were.
+        """
+        for name in kwargs.keys() & {"ent_coef", "cql_alpha"}:
+            was_learned = f"{name}_optimizer" in load_from_zip_file(path, device="cpu", load_data=False)[1]
+            if was_learned != str(kwargs[name]).startswith("auto"):
+                problem = f"{name} is {kwargs[name]!r}, and the saved model's was {'learned' if was_learned else 'fixed'}"
+                raise TypeError(f"{cls.__name__}: {problem}; leave it so, or train a new model")
+        return super().load(path, *args, **kwargs)

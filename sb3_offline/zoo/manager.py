@@ -80,7 +80,7 @@ class OfflineExperimentManager(ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         try:
             return super().setup_experiment()
-        except TypeError as error:
+        except (TypeError, ValueError) as error:
             raise RuntimeError(f"{self.algo}: {error}; check the config and --hyperparams") from error
 
     def learn(self, model: BaseAlgorithm) -> None:
