@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from sb3_offline.envs import ENV_ID
+from sb3_offline.envs import ENV_ID, lacks_task
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -168,7 +168,7 @@ def _evaluate(parser: argparse.ArgumentParser) -> Callable:
         model, run_config = load(args.model)
         if args.task:
             run_config["env_kwargs"]["task"] = args.task
-        if run_config["env"] == ENV_ID and "task" not in run_config["env_kwargs"]:
+        if lacks_task(run_config["env"], run_config["env_kwargs"]):
             sys.exit(f"sb3-offline: {args.model}: was trained for no task in particular; say which one it is to play: --task")
         result = evaluate_success(model, run_config["env"], run_config["env_kwargs"], args.episodes, args.seed)
         low, high = result.interval

@@ -26,9 +26,8 @@ def test_an_algorithm_keeps_to_its_device(algo, policy, files, tmp_path, monkeyp
         assert all(isinstance(parameter, DeviceTensor) for parameter in model.policy.parameters())
         waits.clear()
         model.learn(3, log_interval=None, reset_num_timesteps=False)
-        assert len(waits) == (
-            3 if algo == "ceborl" else 0
-        ), waits  # CEBORL's policy batches are drawn by weights on the device
+        # CEBORL's policy batches are drawn by weights on the device
+        assert len(waits) == (3 if algo == "ceborl" else 0), waits
         actions, _ = model.predict(batch_of(POLICIES[policy]), deterministic=True)
         model.save(tmp_path / "model")
         kwargs = {"examples": files[policy][1]} if needs_examples(algo) else {}

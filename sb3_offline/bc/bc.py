@@ -39,6 +39,7 @@ class BC(OfflineAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {"loss": ("log_prob", "mse")}
     actor: OfflineActor
 
     def __init__(
@@ -74,8 +75,6 @@ class BC(OfflineAlgorithm):
             device=device,
             seed=seed,
         )
-        if loss not in ("log_prob", "mse"):
-            raise TypeError(f"BC: loss is {loss!r}; choose 'log_prob' or 'mse'")
         self.loss = loss
 
         if _init_setup_model:

@@ -36,14 +36,6 @@ PAPER_FORM: dict[str, Any] = {
     "example_share": 0.0,
 }
 
-_CHOICES = {
-    "mu": ("uniform", "policy", "mixture"),
-    "penalty_space": ("probability", "logit"),
-    "backup": ("dataset", "policy", "expectile"),
-    "policy_extraction": ("weighted", "maximize"),
-    "advantage": ("return", "value"),
-}
-
 #: Diagnostics that need extra forward passes are taken once in so many gradient steps.
 DIAGNOSTICS_INTERVAL = 50
 
@@ -129,6 +121,13 @@ class CEBORL(ExampleBasedAlgorithm):
         "policy_batches": COUNT,
         "ent_coef": NOT_NEGATIVE,
         "policy_random_shift": WHOLE + OR_NONE,
+    }
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {
+        "mu": ("uniform", "policy", "mixture"),
+        "penalty_space": ("probability", "logit"),
+        "backup": ("dataset", "policy", "expectile"),
+        "policy_extraction": ("weighted", "maximize"),
+        "advantage": ("return", "value"),
     }
 
     def __init__(
@@ -220,14 +219,9 @@ class CEBORL(ExampleBasedAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise TypeError(f"{type(self).__name__}: {name} is {getattr(self, name)!r}; choose one of {choices}")
         if self.policy_random_shift and self.policy_extraction == "maximize":
-            problem = (
-                "shifts the images that the policy imitates, but policy_extraction='maximize' imitates none; leave it out"
-            )
-            raise TypeError(f"{type(self).__name__}: policy_random_shift {problem}")
+            remedy = "policy_extraction='maximize' imitates no images that it could shift; leave it out"
+            raise TypeError(f"{type(self).__name__}: policy_random_shift is {self.policy_random_shift}, but {remedy}")
         if self.mu == "mixture" and self.n_action_samples == 1:
             raise TypeError(f"{type(self).__name__}: mu='mixture' takes half of the actions each; give n_action_samples >= 2")
         self.needs_next_actions = self.backup != "policy"

@@ -1,7 +1,7 @@
-"""What numbers the constructors of the algorithms take."""
+"""What numbers and names the constructors of the algorithms take."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -32,3 +32,13 @@ def check_numbers(model: Any, kinds: Mapping[str, str]) -> None:
             continue
         if not isinstance(value, Real) or isinstance(value, bool) or not _FITS[kind.removesuffix(OR_NONE)](value):
             raise TypeError(f"{type(model).__name__}: {name} is {value!r}; give {kind}")
+
+
+def check_choices(model: Any, choices: Mapping[str, Sequence[str]]) -> None:
+    """
+    :param model: has them as attributes; raises ``TypeError`` where one is something else
+    :param choices: by name
+    """
+    for name, allowed in choices.items():
+        if getattr(model, name) not in allowed:
+            raise TypeError(f"{type(model).__name__}: {name} is {getattr(model, name)!r}; choose one of {allowed}")

@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_offline.common.augmentation import has_images, shift_observations
-from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, check_numbers
+from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, check_choices, check_numbers
 from sb3_offline.common.process import prepare_process
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer
@@ -60,7 +60,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
     #: whether ``train()`` needs the dataset's action at the next step (an episode's last step is then its own successor)
     needs_next_actions: bool = False
-    #: what the constructor's numbers are to be; a subclass names its own
+    #: what the constructor's numbers are to be; a subclass names its own, and in ``choices`` what its texts may be
     numbers: ClassVar[dict[str, str]] = {
         "batch_size": COUNT,
         "tau": SHARE,
@@ -134,6 +134,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
         for cls in type(self).__mro__:
             check_numbers(self, vars(cls).get("numbers", {}))
+            check_choices(self, vars(cls).get("choices", {}))
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)  # a loaded model keeps the states of its generators
         if self.env is None:

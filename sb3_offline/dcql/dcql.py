@@ -36,6 +36,7 @@ class DCQL(ExampleBasedAlgorithm, CQL):
     """
 
     numbers: ClassVar[dict[str, str]] = {"reward_scale": POSITIVE}
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {"distance": ("l2", "mse")}
 
     def __init__(
         self,
@@ -54,8 +55,6 @@ class DCQL(ExampleBasedAlgorithm, CQL):
             raise TypeError("DCQL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
         if "example_batch_size" in kwargs:
             raise TypeError("DCQL compares with all of the examples, so it has no example_batch_size; leave it out")
-        if distance not in ("l2", "mse"):
-            raise TypeError(f"DCQL: distance is {distance!r}; choose 'l2' or 'mse'")
         self.distance = distance
         self.reward_scale = reward_scale
         super().__init__(

@@ -1,5 +1,8 @@
 """Environments, registered with gymnasium by id; what an environment needs is imported only when it is made."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import gymnasium as gym
 
 ENV_ID = "MultimodalMetaworld-v0"
@@ -7,3 +10,12 @@ ENV_ID = "MultimodalMetaworld-v0"
 if ENV_ID not in gym.registry:
     # No max_episode_steps: the environment truncates by itself, after its `episode_length`.
     gym.register(ENV_ID, entry_point="sb3_offline.envs.multimodal_metaworld:MultimodalMetaworldEnv")
+
+
+def lacks_task(env_id: str, env_kwargs: Mapping[str, Any]) -> bool:
+    """
+    :param env_id: of an environment to evaluate in
+    :param env_kwargs: of it
+    :return: whether these leave it open which task is meant
+    """
+    return env_id == ENV_ID and "task" not in env_kwargs

@@ -64,8 +64,9 @@ class OfflineEvalCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         model = self.model
-        self.buffer = model.replay_buffer.single_steps()
-        if self.dataset is not None:
+        if self.dataset is None:
+            self.buffer = model.replay_buffer.single_steps()
+        else:
             self.buffer = OfflineReplayBuffer(
                 self.dataset, model.observation_space, model.action_space, model.device, gamma=model.gamma
             )

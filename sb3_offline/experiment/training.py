@@ -21,7 +21,7 @@ from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.envs import ENV_ID
+from sb3_offline.envs import lacks_task
 from sb3_offline.experiment.data import resolve_data
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, Evaluation, evaluate_success, make_evaluation_env
 
@@ -270,7 +270,7 @@ def train(
             raise RuntimeError(f"{name} is {count!r}; give a number of at least 1")
     if eval_freq > 0:
         _check_registered(env_id)
-        if env_id == ENV_ID and "task" not in config["env_kwargs"]:
+        if lacks_task(env_id, config["env_kwargs"]):
             raise RuntimeError(f"{env_id} has several tasks; say which one to evaluate: --task, or `task` in env_kwargs")
         table = output / "evaluations.csv"
         all_callbacks.append(EvaluationTable(table, env_id, config["env_kwargs"], eval_freq, n_eval_episodes, verbose=verbose))
