@@ -67,7 +67,7 @@ def sampling(path: Path, storage: str) -> list[float]:
 
     def step() -> None:
         batch = buffer.sample(BATCH_SIZE)
-        for images in (batch.observations, batch.next_observations, batch.nstep_observations):
+        for images in (batch.observations, *(horizon.observations for horizon in batch.horizons)):
             random_shift(images, 4, buffer.rng)  # type: ignore[arg-type]
 
     step()

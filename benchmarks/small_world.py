@@ -256,7 +256,7 @@ def _improved_policy(
         return best / best.sum(dim=1, keepdim=True)
     example_logits = (policy[GOAL] * logits[GOAL].exp()).sum().log().view(1, 1)
     # Of an action's outcomes, only the classifier's odds are a table: advantage="value"
-    weights = losses.advantage_weights(
+    weights = losses.odds_ratio_weights(
         logits.exp().flatten(),
         state_logits.repeat_interleave(N_ACTIONS),
         example_logits,

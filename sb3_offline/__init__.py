@@ -3,28 +3,21 @@
 from pathlib import Path
 
 import sb3_offline.envs  # noqa: F401  (registers the environments)
-from sb3_offline.bc import BC
-from sb3_offline.ceborl import CEBORL
-from sb3_offline.common.offline_algorithm import OfflineAlgorithm
-from sb3_offline.cql import CQL
-from sb3_offline.dcql import DCQL
-from sb3_offline.iql import IQL
-from sb3_offline.oril import ORIL
-from sb3_offline.rce import RCE
-from sb3_offline.td3_bc import TD3BC
+
+# The registry: an algorithm is one import line here. The command line, the RL Zoo, the conformance tests and the lists in the
+# docs follow from it.
+from sb3_offline.bc import BC as BC
+from sb3_offline.ceborl import CEBORL as CEBORL
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm as OfflineAlgorithm
+from sb3_offline.common.registry import algorithms_in
+from sb3_offline.cql import CQL as CQL
+from sb3_offline.dcql import DCQL as DCQL
+from sb3_offline.iql import IQL as IQL
+from sb3_offline.oril import ORIL as ORIL
+from sb3_offline.rce import RCE as RCE
+from sb3_offline.td3_bc import TD3BC as TD3BC
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
-#: All algorithms by the names that configs and the command line use.
-ALGOS: dict[str, type[OfflineAlgorithm]] = {
-    "bc": BC,
-    "ceborl": CEBORL,
-    "cql": CQL,
-    "dcql": DCQL,
-    "iql": IQL,
-    "oril": ORIL,
-    "rce": RCE,
-    "td3_bc": TD3BC,
-}
-
-__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "DCQL", "IQL", "ORIL", "RCE", "TD3BC", "OfflineAlgorithm", "__version__"]
+#: All algorithms by the names that configs and the command line use, which are the names of their folders.
+ALGOS: dict[str, type[OfflineAlgorithm]] = algorithms_in(globals())

@@ -121,7 +121,7 @@ def same_noise(model, monkeypatch):
 def test_cql(cql_alpha, dataset, monkeypatch):
     gap = 2.5
     model, batch, losses = make(
-        CQL, dataset, monkeypatch, cql_alpha=cql_alpha, cql_target_gap=gap, n_action_samples=N_SAMPLES, ent_coef="auto_0.3"
+        CQL, dataset, monkeypatch, cql_alpha=cql_alpha, lagrange_threshold=gap, n_action_samples=N_SAMPLES, ent_coef="auto_0.3"
     )
     config = d3rlpy.algos.CQLConfig(
         **CONFIG,

@@ -1,3 +1,4 @@
+import itertools
 import pickle
 
 import h5py
@@ -49,15 +50,17 @@ def transitions_by_slow_loop(episodes, n_steps, next_actions):
                     "dones": [done[t]],
                     "rewards": [reward[t]],
                     "discounts": [GAMMA],
-                    "next_actions": action[one] if next_actions else None,
-                    "nstep_observations": obs[end],
-                    "nstep_actions": action[end] if next_actions else None,
-                    "nstep_discounts": [discount],
-                    "nstep_rewards": [reward_sum],
-                    "nstep_dones": [done[done_at]],
+                    "one_step": (obs[one], [reward[t]], [done[t]], [GAMMA], action[one] if next_actions else None),
+                    "n_steps": (obs[end], [reward_sum], [done[done_at]], [discount], action[end] if next_actions else None),
                 }
             )
     return rows
+
+
+def tensors_of(samples):
+    """All tensors of a batch, those of its horizons too."""
+    parts = [*samples[:6], samples.indices, *itertools.chain.from_iterable(samples.horizons)]
+    return [part for part in parts if part is not None]
 
 
 @pytest.mark.parametrize("storage", ["memory", "mmap"])
@@ -71,16 +74,20 @@ def test_samples_are_those_of_a_slow_loop(tmp_path, n_steps, next_actions, stora
     expected = transitions_by_slow_loop(episodes, n_steps, next_actions)
     assert buffer.size() == len(expected)
     samples = buffer.transitions(np.arange(buffer.size()))
-    for name, values in samples._asdict().items():
-        if values is None:
-            assert (n_steps == 1 and name.startswith("nstep")) or (not next_actions and name.endswith("_actions"))
-            continue
-        if name == "steps":
-            assert values.tolist() == list(range(len(expected)))
-            continue
-        wanted = np.array([row[name] for row in expected], dtype=np.float32)
-        assert values.dtype == th.float32 and values.shape == wanted.shape, name
-        np.testing.assert_allclose(values.numpy(), wanted, rtol=1e-5, atol=1e-6, err_msg=name)
+    assert samples.indices.tolist() == list(range(len(expected)))
+    assert len(samples.horizons) == (1 if n_steps == 1 else 2)
+
+    def check(values, rows):
+        wanted = np.array(rows, dtype=np.float32)
+        assert values.dtype == th.float32 and values.shape == wanted.shape
+        np.testing.assert_allclose(values.numpy(), wanted, rtol=1e-5, atol=1e-6)
+
+    for name in ("observations", "actions", "next_observations", "dones", "rewards", "discounts"):
+        check(getattr(samples, name), [row[name] for row in expected])
+    for name, horizon in zip(("one_step", "n_steps"), samples.horizons, strict=False):
+        assert (horizon.next_actions is not None) == next_actions
+        for index, values in enumerate(horizon if next_actions else horizon[:-1]):
+            check(values, [row[name][index] for row in expected])
 
 
 def test_every_step_is_drawn_equally_often(tmp_path):
@@ -106,8 +113,8 @@ def test_memory_map_and_compressed_files_give_the_same_samples(tmp_path):
         batches.append([buffer.sample(64) for _ in range(3)])
     for first, *others in zip(*batches, strict=True):
         for other in others:
-            for a, b in zip(first, other, strict=True):
-                assert a is b is None or th.equal(a, b)
+            for a, b in zip(tensors_of(first), tensors_of(other), strict=True):
+                assert th.equal(a, b)
     with pytest.raises(DatasetError, match=r"b.small: observations: is compressed.*convert"):
         OfflineReplayBuffer(compressed, CHANNEL_FIRST, ACTIONS, "cpu", storage="mmap")
 
@@ -176,7 +183,7 @@ def test_resume_continues_with_the_same_batches(tmp_path):
     other = OfflineReplayBuffer(tmp_path / "a.h5", CHANNEL_FIRST, ACTIONS, "cpu", n_steps=3, next_actions=True)
     other.set_rng_state(state)
     for samples in (copy.sample(32), other.sample(32)):
-        assert all(th.equal(a, b) for a, b in zip(samples, wanted, strict=True))
+        assert all(th.equal(a, b) for a, b in zip(tensors_of(samples), tensors_of(wanted), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_a_saved_buffer_brings_its_place_and_no_other_data(paths, tmp_path):
     assert model.replay_buffer.get_rng_state() == state
 
     other = CQL.load(tmp_path / "model", dataset=paths[1])
-    with pytest.warns(UserWarning, match="of other data"):
+    with pytest.warns(UserWarning, match="over other data"):
         other.load_replay_buffer(tmp_path / "buffer")
     assert str(other.replay_buffer.datasets[0].path) == paths[1]
     relabelled = CQL.load(tmp_path / "model", reward_fn="success")
@@ -60,10 +60,10 @@ def test_kept_transitions_are_those_of_the_dataset(paths, tmp_path):
     kept = []
     for again in (same, other):
         again.learn(1, reset_num_timesteps=False)
-        kept.append(len(again._weighted_transitions.steps))
+        kept.append(len(again._extraction.pool.indices))
     assert kept == [4, 1]
     shorter = CEBORL.load(tmp_path / "model", examples=examples, policy_batches=2).learn(3)
-    assert len(shorter._weighted_transitions.steps) == 2
+    assert len(shorter._extraction.pool.indices) == 2
 
 
 def test_a_loaded_model_takes_another_delay(paths, tmp_path):

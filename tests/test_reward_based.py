@@ -16,7 +16,7 @@ from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.cql.losses import conservative_gaps
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
-from sb3_offline.iql.losses import advantage_weights
+from sb3_offline.iql.losses import exponential_weights
 from sb3_offline.oril.losses import classifier_loss
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)
@@ -66,8 +66,8 @@ def test_bellman_expectile_and_weights():
     expected = np.where(targets < 0, 0.2, 0.8) @ targets**2 / 64
     np.testing.assert_allclose(expectile_loss(tensor(targets), 0.8), expected, rtol=1e-5)
     expected = np.minimum(np.exp(3 * targets), 5)
-    np.testing.assert_allclose(advantage_weights(tensor(targets), 3.0, 5.0), expected, rtol=1e-5)
-    assert advantage_weights(th.tensor([1e6]), 3.0, 100.0).item() == pytest.approx(100.0)
+    np.testing.assert_allclose(exponential_weights(tensor(targets), 3.0, 5.0), expected, rtol=1e-5)
+    assert exponential_weights(th.tensor([1e6]), 3.0, 100.0).item() == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize("eta", [None, 0.5])
@@ -104,9 +104,8 @@ def test_a_step_of_cql(n_steps, folder, monkeypatch):
     monkeypatch.setattr(th, "rand_like", lambda like: uniform)
     model.train(1, 64)
 
-    names = ("rewards", "dones", "discounts")
-    rewards, dones, discounts = (getattr(batch, name if n_steps == 1 else f"nstep_{name}") for name in names)
-    following = batch.next_observations if n_steps == 1 else batch.nstep_observations
+    assert len(batch.horizons) == (1 if n_steps == 1 else 2)
+    following, rewards, dones, discounts, _ = batch.horizons[-1]
     assert dones.any()
     z, z_next = (model.critic.encode(o) for o in (batch.observations, following))
     own, current, after = draws
@@ -129,7 +128,7 @@ def test_a_step_of_cql(n_steps, folder, monkeypatch):
 def test_learned_coefficients_move_towards_their_goals_and_are_saved(folder, tmp_path):
     path = str(folder / "states.h5")
     for gap, ratio in ((-100.0, 1), (1000.0, -1)):  # always above it, always under it
-        kwargs = {"ent_coef": "auto_0.5", "cql_alpha": "auto_2", "cql_target_gap": gap, "target_entropy": 100 * ratio}
+        kwargs = {"ent_coef": "auto_0.5", "cql_alpha": "auto_2", "lagrange_threshold": gap, "target_entropy": 100 * ratio}
         model = CQL("MlpPolicy", None, path, learning_rate=1e-2, seed=0, policy_kwargs=SMALL, **kwargs).learn(5)
         assert (model.log_cql_alpha.item() - np.log(2)) * ratio > 0.04
         assert (model.log_ent_coef.item() - np.log(0.5)) * ratio > 0.04
@@ -163,7 +162,7 @@ def test_rewards_of_a_function_take_the_place_of_the_datasets(algorithm, folder,
     wanted = old.next_observations[:, :1] + 2 * old.actions.sum(dim=1, keepdim=True) + old.rewards
     th.testing.assert_close(new.rewards, wanted)
     first = int(np.flatnonzero(plain._steps_left >= 3)[0])
-    th.testing.assert_close(new.nstep_rewards[first, 0], (wanted[first : first + 3, 0] * tensor([1, 0.5, 0.25])).sum())
+    th.testing.assert_close(new.horizons[1].rewards[first, 0], (wanted[first : first + 3, 0] * tensor([1, 0.5, 0.25])).sum())
 
     model.save(tmp_path / "model")  # the function too
     np.testing.assert_array_equal(algorithm.load(tmp_path / "model").replay_buffer.rewards, model.replay_buffer.rewards)
@@ -197,7 +196,7 @@ def test_missing_and_broken_rewards_are_named(folder, tmp_path):
     with pytest.raises(TypeError, match="reward_fn is 'succes'"):
         CQL("MlpPolicy", None, with_none, reward_fn="succes")
     for algorithm in (DCQL, ORIL):
-        with pytest.raises(TypeError, match="makes its rewards of the examples"):
+        with pytest.raises(TypeError, match="makes its rewards from the examples"):
             algorithm("MlpPolicy", None, with_none, EXAMPLES, reward_fn="success")
     CQL("MlpPolicy", None, with_none, policy_kwargs=SMALL, reward_fn=lambda batch: th.ones(len(batch.dones), 1)).learn(1)
     for broken in (lambda batch: batch.actions, lambda batch: batch.rewards * np.nan, lambda batch: 1.0):

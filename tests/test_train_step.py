@@ -1,6 +1,7 @@
 """One step of ``train()`` against a plain NumPy float64 reading of Eq. 10 and 11: what goes into the terms, not they alone."""
 
 import copy
+import inspect
 from functools import partial
 
 import numpy as np
@@ -101,9 +102,8 @@ def test_default_form(dataset, monkeypatch, advantage):
     )
     reading = Reading(model, monkeypatch)
     batch, examples, target = reading.batch, reading.examples, model.critic_target
-    one = np.exp(reading.logits(target, batch.next_observations, batch.next_actions).min(axis=0))
-    many = np.exp(reading.logits(target, batch.nstep_observations, batch.nstep_actions).min(axis=0))
-    weight = 0.5 * (GAMMA * one + batch.nstep_discounts.numpy()[:, 0] * many)
+    one, many = (np.exp(reading.logits(target, h.observations, h.next_actions).min(axis=0)) for h in batch.horizons)
+    weight = 0.5 * (GAMMA * one + batch.horizons[1].discounts.numpy()[:, 0] * many)
     example_weight = GAMMA * np.exp(reading.logits(target, examples, reading.mode(examples)).min(axis=0))
     f = reading.logits(model.critic, batch.observations, batch.actions)
     f_examples = reading.logits(model.critic, examples, reading.mode(examples))
@@ -122,7 +122,7 @@ def test_default_form(dataset, monkeypatch, advantage):
     weights = ((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
     weights = np.minimum(weights, weight_max) * (np.exp(v) / (np.exp(v) + eps)) ** exponent
-    monkeypatch.setattr(model._weighted_transitions, "draw", lambda n: batch.steps[:n].numpy())
+    monkeypatch.setattr(model._extraction.pool, "draw", lambda n: batch.indices[:n].numpy())
     with th.no_grad():
         mean, log_std = (x.double().numpy() for x in model.actor.gaussian_parameters(model.actor.encode(batch.observations)))
     actions = batch.actions.double().numpy()
@@ -133,8 +133,8 @@ def test_default_form(dataset, monkeypatch, advantage):
 
     critic_loss, actor_loss = reading.train()
     assert critic_loss == pytest.approx(beta * a + b + recursive(f, weight) + state, rel=1e-5)
-    np.testing.assert_allclose(model._weighted_transitions.weights[-1], weights, rtol=1e-4)
-    np.testing.assert_array_equal(model._weighted_transitions.steps[-1], batch.steps)
+    np.testing.assert_allclose(model._extraction.pool.weights[-1], weights, rtol=1e-4)
+    np.testing.assert_array_equal(model._extraction.pool.indices[-1], batch.indices)
     assert actor_loss == pytest.approx(regression.mean(), rel=1e-3)
 
 
@@ -143,8 +143,8 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
     kept = WeightedTransitions(2)
     for first in (0, 10, 20):
         kept.add(th.arange(first, first + 2), th.tensor([1.0, 3.0]))
-    steps, counts = np.unique(kept.draw(8000), return_counts=True)
-    np.testing.assert_array_equal(steps, [10, 11, 20, 21])
+    indices, counts = np.unique(kept.draw(8000), return_counts=True)
+    np.testing.assert_array_equal(indices, [10, 11, 20, 21])
     np.testing.assert_allclose(counts / 8000, [0.125, 0.375, 0.125, 0.375], atol=0.03)
     assert kept.effective_share().item() == pytest.approx(0.8)
 
@@ -152,12 +152,12 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
 def test_with_another_dataset_no_transitions_of_the_old_one_are_drawn(dataset, tmp_path):
     write_dataset(tmp_path / "small.h5", 2, STATES)
     model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, batch_size=64, policy_kwargs=SMALL).learn(3)
-    kept = model._weighted_transitions.steps
+    kept = model._extraction.pool.indices
     model.learn(1)
-    assert model._weighted_transitions.steps.shape == (4, 64) and th.equal(model._weighted_transitions.steps[:3], kept)
+    assert model._extraction.pool.indices.shape == (4, 64) and th.equal(model._extraction.pool.indices[:3], kept)
     model.dataset = tmp_path / "small.h5"
     model.learn(1)
-    assert model._weighted_transitions.steps.max() < model.replay_buffer.size() and len(model._weighted_transitions.steps) == 1
+    assert model._extraction.pool.indices.max() < model.replay_buffer.size() and len(model._extraction.pool.indices) == 1
 
 
 def test_paper_form(dataset, monkeypatch):
@@ -178,9 +178,21 @@ def test_paper_form(dataset, monkeypatch):
     assert actor_loss == pytest.approx((0.05 * -3.0 - sigmoid(f_policy.min(axis=0))).mean(), rel=1e-5)
 
 
+def test_the_paper_form_names_every_setting():
+    """A preset that leaves a setting out would change with the constructor's default."""
+    about_the_run = {"policy", "env", "dataset", "examples", "dataset_storage", "stats_window_size", "tensorboard_log"}
+    about_the_run |= {"self", "policy_kwargs", "verbose", "seed", "device", "_init_setup_model"}
+    assert PAPER_FORM.keys() == inspect.signature(CEBORL.__init__).parameters.keys() - about_the_run
+
+
 def test_rce_is_the_paper_form_without_the_penalty(dataset):
-    model = RCE("MlpPolicy", None, dataset / "states.h5", EXAMPLES)
-    assert {name: getattr(model, name) for name in PAPER_FORM} == {**PAPER_FORM, "beta": 0.0}
+    data = ("MlpPolicy", None, dataset / "states.h5", EXAMPLES)
+    model, paper = RCE(*data), CEBORL(*data, **PAPER_FORM)
+    assert {name: getattr(model, name) for name in PAPER_FORM if hasattr(model, name)}.items() <= PAPER_FORM.items()
+    for part in ("_backup", "_extraction"):
+        assert type(getattr(model, part)) is type(getattr(paper, part))
+    with pytest.raises(TypeError, match="beta"):  # what means nothing to it is refused by name
+        RCE(*data, beta=0.1)
 
 
 def test_densities_of_actions_are_those_of_sb3(dataset):
@@ -336,7 +348,9 @@ def test_random_shift_repeats_edges(max_shift):
 
 
 def test_a_frozen_encoder_stays_frozen(dataset):
-    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, batch_size=8, policy_kwargs=BATCH_NORM, **PAPER_FORM)
+    model = CEBORL(
+        "MlpPolicy", None, dataset / "states.h5", EXAMPLES, policy_kwargs=BATCH_NORM, **{**PAPER_FORM, "batch_size": 8}
+    )
     model.critic.features_extractor.requires_grad_(False)
     model.learn(2)
     assert not any(parameter.requires_grad for parameter in model.critic.features_extractor.parameters())

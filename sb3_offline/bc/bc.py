@@ -1,5 +1,6 @@
 """Behavioral cloning."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch as th
@@ -7,14 +8,16 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.bc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_offline.common.hyperparameters import Constraints, Options
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.policies import OfflineActor
+from sb3_offline.common.search import LEARNING, Choice, SearchSpace
 from sb3_offline.data.reader import DatasetSource
 
 
 class BC(OfflineAlgorithm):
     """
-    Behavioral cloning (BC): imitates all of the dataset, ``max E_D[log pi(a | s)]``, or ``min E_D[(tanh(mean(s)) - a)^2]``.
+    Behavioral cloning (BC): imitates the whole dataset, ``max E_D[log pi(a | s)]``, or ``min E_D[(tanh(mean(s)) - a)^2]``.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: The environment the policy is meant for, a registered id, or ``None`` (spaces from the dataset)
@@ -39,7 +42,8 @@ class BC(OfflineAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    choices: ClassVar[dict[str, tuple[str, ...]]] = {"loss": ("log_prob", "mse")}
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {"loss": [Options(("log_prob", "mse"))]}
+    search_space: ClassVar[SearchSpace] = {**LEARNING, "loss": Choice("mse", "log_prob")}
     actor: OfflineActor
 
     def __init__(

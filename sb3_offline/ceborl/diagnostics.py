@@ -1,4 +1,4 @@
-"""Says while a classifier is trained what goes wrong with it, and what to try."""
+"""A callback that warns of what goes wrong while a classifier of success is trained, and says what to try."""
 
 import math
 import warnings
@@ -8,7 +8,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_offline.ceborl.ceborl import CEBORL
+from sb3_offline.ceborl.classifier import RecursiveClassifier
+from sb3_offline.ceborl.extraction import WeightedRegression
 from sb3_offline.common.callbacks import log_at_once
 
 SATURATED_CLASSIFIER, SATURATED_SHARE = 0.99, 0.5
@@ -50,25 +51,25 @@ _REMEDIES = {
 
 class DiagnosticsCallback(BaseCallback):
     """
-    Watches CEBORL or RCE while they learn, and warns once of each of these, with the remedy to try:
+    Watches CEBORL or RCE while they learn. It warns once of each of these problems and names a remedy to try:
 
-    - the classifier saturates: it says success on most of the data
-    - omega hits its bound
+    - the classifier saturates: it predicts success for most of the data
+    - omega reaches its bound
     - the actor collapses onto the bounds of the action space
-    - examples are told apart from the data at once, which is a domain gap, and not success
-    - the weighted regression comes down to a few transitions
+    - the classifier tells the examples from the data at once, which indicates a domain gap instead of success
+    - the weighted regression imitates only a few transitions
 
-    It looks at transitions drawn with a generator of its own, so a run with it is the same as one without. What it measures
-    is logged under ``diagnostics/``.
+    It draws its transitions with its own generator, so a run with the callback equals a run without it. It logs its
+    measurements under ``diagnostics/``.
 
-    :param check_freq: gradient steps between two looks
-    :param n_transitions: transitions to look at, and all examples
-    :param early_steps: up to this step, examples and data that are perfectly told apart count as a domain gap. Later, a
+    :param check_freq: gradient steps between two checks
+    :param n_transitions: number of transitions that are checked, beside all examples
+    :param early_steps: last step at which examples that are perfectly told from the data count as a domain gap. Later, a
         classifier may know all of its examples by heart
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     """
 
-    model: CEBORL
+    model: RecursiveClassifier
 
     def __init__(self, check_freq: int = 500, n_transitions: int = 1024, early_steps: int = 2000, verbose: int = 0):
         super().__init__(verbose)
@@ -77,7 +78,7 @@ class DiagnosticsCallback(BaseCallback):
         self._rng = np.random.default_rng(0)
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, CEBORL):
+        if not isinstance(self.model, RecursiveClassifier):
             raise TypeError(f"DiagnosticsCallback is for CEBORL and RCE, not for {type(self.model).__name__}")
 
     def _on_step(self) -> bool:
@@ -118,9 +119,11 @@ class DiagnosticsCallback(BaseCallback):
 
     def _judge(self, found: dict[str, float]) -> None:
         more = found["actions_on_bounds"] - found["data_actions_on_bounds"]
-        kept = self.model._weighted_transitions
-        n_kept = kept.weights.numel()
-        effective_transitions = float(kept.effective_share()) * n_kept if n_kept else math.inf
+        n_kept, effective_transitions = 0, math.inf
+        extraction = self.model._extraction
+        if isinstance(extraction, WeightedRegression) and extraction.pool.weights.numel():
+            n_kept = extraction.pool.weights.numel()
+            effective_transitions = float(extraction.pool.effective_share()) * n_kept
         wrong = {
             "classifier_saturated": found["classifier_saturated"] > SATURATED_SHARE,
             "omega_clipped": found["omega_clipped"] > CLIPPED_SHARE,
@@ -130,7 +133,7 @@ class DiagnosticsCallback(BaseCallback):
         }
         about = {
             **found,
-            **{name: getattr(self.model, name) for name in ("omega_max", "temperature", "advantage_floor")},
+            **{name: getattr(self.model, name, None) for name in ("omega_max", "temperature", "advantage_floor")},
             "saturated": SATURATED_CLASSIFIER,
             "effective_transitions": effective_transitions,
             "n_kept": n_kept,

@@ -1,17 +1,21 @@
 """
-The terms of the paper's Eq. 10 as plain functions of classifier logits. They know no network, optimizer or dataset.
+The terms of the paper's Eq. 10 as plain functions of classifier logits, without networks, optimizers or datasets.
 
 Notation: ``f`` is a critic's logit, ``C = sigmoid(f)`` its probability of success, ``C / (1 - C) = exp(f)`` the odds that
 serve as the Q-value. All logits carry the critics as their first axis. Everything is computed in float32 at least.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch as th
 from torch.nn import functional as F
 
-#: Odds beyond this are out of any use; the bound keeps float32 finite.
+#: Bound of odds that keeps float32 finite. Larger odds are meaningless.
 OVERFLOW = 1e8
+
+#: Smallest distance of a mean probability from 0 and 1 before its logit is taken
+PROBABILITY_EPSILON = 1e-7
 
 
 def _full_precision(logits: th.Tensor) -> th.Tensor:
@@ -21,16 +25,49 @@ def _full_precision(logits: th.Tensor) -> th.Tensor:
 
 def success_odds(target_logits: th.Tensor, omega_max: float) -> th.Tensor:
     """
-    Eq. 3: ``omega = C / (1 - C)`` at the next step, the smallest of the critics.
+    Eq. 3: ``omega = C / (1 - C)`` at the next step, the lowest of the critics.
 
-    The ratio itself, not its logarithm: Eq. 3 as printed would make labels negative. It is a density ratio and may be far
-    above 1, so ``omega_max`` is there against overflow, not to shape values.
+    Omega is the ratio itself and not its logarithm, as Eq. 3 is printed, which would make labels negative. As a density ratio
+    it may be far above 1; ``omega_max`` only prevents overflow and is not meant to shape values.
 
     :param target_logits: logits of the target critics at the next state and action, ``(n_critics, batch)``
     :param omega_max: upper bound
     :return: ``(batch,)``
     """
     return _full_precision(target_logits).amin(dim=0).clamp(max=math.log(omega_max)).exp()
+
+
+def mean_of_odds(target_logits: Sequence[th.Tensor], discounts: Sequence[th.Tensor], omega_max: float) -> th.Tensor:
+    """
+    ``gamma * omega`` over several horizons: the mean of their discounted odds.
+
+    :param target_logits: logits of the target critics after each horizon, ``(n_critics, batch)`` each
+    :param discounts: ``gamma ** n`` of each horizon, ``(batch,)`` each
+    :param omega_max: upper bound of the odds
+    :return: ``(batch,)``
+    """
+    discounted = [d * success_odds(logits, omega_max) for d, logits in zip(discounts, target_logits, strict=True)]
+    return sum(discounted[1:], start=discounted[0]) / len(discounted)
+
+
+def odds_of_mean_probability(
+    target_logits: Sequence[th.Tensor], discounts: Sequence[th.Tensor], gamma: float, omega_max: float
+) -> th.Tensor:
+    """
+    ``gamma * omega`` over several horizons, as the authors of RCE take it: the odds of the mean *probability*. For 1 and n
+    steps: ``omega = Cbar / (1 - Cbar)``, ``Cbar = (C(s_1, a_1) + gamma ** n C(s_n, a_n)) / 2``.
+
+    :param target_logits: logits of the target critics after each horizon, the 1-step one first, ``(n_critics, batch)`` each
+    :param discounts: ``gamma ** n`` of each horizon, ``(batch,)`` each
+    :param gamma: discount factor
+    :param omega_max: upper bound of the odds
+    :return: ``(batch,)``
+    """
+    if len(target_logits) == 1:  # the odds themselves: a probability near 1 is rounded in float32
+        return discounts[0] * success_odds(target_logits[0], omega_max)
+    one_step, *longer = (logits.sigmoid() for logits in target_logits)
+    total = sum((d * c for d, c in zip(discounts[1:], longer, strict=True)), start=one_step)
+    return gamma * success_odds(th.logit(total / len(target_logits), eps=PROBABILITY_EPSILON), omega_max)
 
 
 def conservative_penalty(data_logits: th.Tensor, sampled_logits: th.Tensor, penalty_space: str = "probability") -> th.Tensor:
@@ -75,7 +112,7 @@ def recursive_loss(data_logits: th.Tensor, discounted_omega: th.Tensor) -> th.Te
     return (discounted_omega * F.softplus(-logits) + F.softplus(logits)).mean(dim=1).sum()
 
 
-def advantage_weights(
+def odds_ratio_weights(
     odds: th.Tensor,
     state_logits: th.Tensor,
     example_logits: th.Tensor,
@@ -85,21 +122,20 @@ def advantage_weights(
     state_exponent: float = 0.0,
 ) -> th.Tensor:
     """
-    How much more comes of the data's action than of the data's actions on average in its state, times how surely that state
-    promises anything: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) **
-    state_exponent``.
+    Advantage weights of the dataset's actions: the odds of the action over the odds of its state, times how promising the
+    state is: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) ** state_exponent``.
 
-    A ratio, since odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share of the examples'
-    odds. Where both odds are far under it, their ratio is noise, the first factor is about 1, and the second is small; where
-    they are above it, the second is about 1: the way to success counts as much as its end.
+    The advantage is a ratio because odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share
+    of the examples' odds. Where both odds are far below it, their ratio is noise: the first factor is about 1, and the second
+    is small. Where both are above it, the second factor is about 1, so the way to success counts as much as its end.
 
-    :param odds: what comes of dataset actions: learned odds, or the target that they are learned from, ``(batch,)``
+    :param odds: outcomes of the dataset's actions: learned odds, or the targets that they are learned from, ``(batch,)``
     :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
-    :param example_logits: logits of success examples, ``(n_critics, batch)``; the scale of the odds
-    :param temperature: the smaller, the sharper
+    :param example_logits: logits of success examples, which set the scale of the odds, ``(n_critics, batch)``
+    :param temperature: the smaller, the sharper the weights
     :param advantage_floor: eps as a share of the examples' mean odds
-    :param weight_max: upper bound of the first factor; that of the second is 1
-    :param state_exponent: how much less states count that promise little; 0: all states count alike
+    :param weight_max: upper bound of the first factor; the second is at most 1
+    :param state_exponent: how much less unpromising states count; 0: all states count alike
     :return: ``(batch,)``
     """
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)

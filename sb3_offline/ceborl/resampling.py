@@ -1,4 +1,4 @@
-"""Batches in which no transition is drawn in vain."""
+"""A pool of weighted transitions, from which batches are drawn by weight."""
 
 from typing import Any
 
@@ -12,10 +12,11 @@ class WeightedTransitions:
     """
     The transitions of the last batches, drawn again in proportion to their weights.
 
-    A weighted loss over a uniform batch learns from the few transitions that have weight: one in fifteen where the data hold
-    five tasks, each solved now and then. Drawn by weight, all of a batch count alike, and the expectation is the same.
+    A weighted loss over a uniform batch learns from the few transitions that have weight: about one in fifteen if the data
+    hold five tasks, each solved now and then. If transitions are drawn by weight, all of a batch count alike, and the expected
+    loss is the same.
 
-    :param n_batches: how many batches are kept; weights are as old as the oldest of them at most
+    :param n_batches: number of kept batches. A weight is at most that many gradient steps old
     """
 
     def __init__(self, n_batches: int):
@@ -23,46 +24,50 @@ class WeightedTransitions:
             raise ValueError(f"The policy has to learn from one batch at least, not from policy_batches={n_batches}")
         self.n_batches = n_batches
         self._n_added = 0
-        # Rings of batches, made when their size is known
-        self._steps = th.empty(0, 0, dtype=th.int64)
+        # Rings of batches, allocated when the batch size is known
+        self._indices = th.empty(0, 0, dtype=th.int64)
         self._weights = th.empty(0, 0)
 
     @property
-    def steps(self) -> th.Tensor:
-        """(kept batches, batch) int64, numbers of the transitions in the dataset, in no particular order of batches"""
-        return self._steps[: self._n_added]
+    def indices(self) -> th.Tensor:
+        """(kept batches, batch) int64, indices of the transitions in the dataset; the batches are in no particular order"""
+        return self._indices[: self._n_added]
 
     @property
     def weights(self) -> th.Tensor:
-        """(kept batches, batch) of the transitions"""
+        """(kept batches, batch), the transitions' weights"""
         return self._weights[: self._n_added]
 
-    def add(self, steps: th.Tensor, weights: th.Tensor) -> None:
+    def add(self, indices: th.Tensor, weights: th.Tensor) -> None:
         """
-        :param steps: (batch,) int64 on the CPU, numbers of the transitions in the dataset; batches of another size than
-            before start anew
+        Keep a batch in place of the oldest one. A batch of another size than before empties the pool first.
+
+        :param indices: (batch,) int64 on the CPU, indices of the transitions in the dataset
         :param weights: ``(batch,)``, positive, no gradient
         """
-        if len(steps) != self._steps.shape[1]:
+        if len(indices) != self._indices.shape[1]:
             self._n_added = 0
-            self._steps = steps.new_zeros(self.n_batches, len(steps))
-            self._weights = weights.new_zeros(self.n_batches, len(steps))
-        self._weights = self._weights.to(weights.device)  # a model that was loaded has them on the CPU
+            self._indices = indices.new_zeros(self.n_batches, len(indices))
+            self._weights = weights.new_zeros(self.n_batches, len(indices))
+        self._weights = self._weights.to(weights.device)  # a loaded model has them on the CPU
         row = self._n_added % self.n_batches
-        self._steps[row], self._weights[row] = steps, weights
+        self._indices[row], self._weights[row] = indices, weights
         self._n_added += 1
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_weights": self._weights.cpu()}  # a saved model loads where there is no such device
+        return {**self.__dict__, "_weights": self._weights.cpu()}  # a saved model also loads where its device is missing
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({"_indices" if name == "_steps" else name: value for name, value in state.items()})  # older zips
 
     def draw(self, n: int) -> np.ndarray:
         """
-        :param n: how many
-        :return: (n,) numbers of transitions, with replacement
+        :param n: number of transitions
+        :return: (n,) indices of transitions, drawn with replacement
         """
         drawn = th.multinomial(self.weights.flatten(), n, replacement=True)
-        return self.steps.flatten()[drawn.cpu()].numpy()
+        return self.indices.flatten()[drawn.cpu()].numpy()
 
     def effective_share(self) -> th.Tensor:
-        """:return: scalar, the part of the transitions that would carry as much if all had the same weight"""
+        """:return: scalar, the share of the transitions that would carry as much if all weights were equal"""
         return effective_share(self.weights.flatten())

@@ -1,44 +1,86 @@
-"""What numbers and names the constructors of the algorithms take."""
+"""Constraints on the arguments of the algorithms' constructors."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
 
-COUNT = "a whole number of at least 1"
-WHOLE = "a whole number of at least 0"
-POSITIVE = "a number above 0"
-NOT_NEGATIVE = "a number of at least 0"
-SHARE = "a number between 0 and 1"
-OR_NONE = ", or None"
 
-_FITS: dict[str, Callable[[Any], bool]] = {
-    COUNT: lambda value: isinstance(value, Integral) and int(value) >= 1,
-    WHOLE: lambda value: isinstance(value, Integral) and int(value) >= 0,
-    POSITIVE: lambda value: value > 0,
-    NOT_NEGATIVE: lambda value: value >= 0 and math.isfinite(value),
-    SHARE: lambda value: 0 <= value <= 1,
-}
-
-
-def check_numbers(model: Any, kinds: Mapping[str, str]) -> None:
+@dataclass(frozen=True)
+class Interval:
     """
-    :param model: has them as attributes; raises ``TypeError`` where one is something else
-    :param kinds: what each is to be: one of the texts above, with or without ``OR_NONE``
+    A constraint: a number within bounds.
+
+    :param low: lower bound
+    :param high: upper bound, which is included
+    :param whole: whether the number is an integer
+    :param includes_low: whether the lower bound is included
+    :param infinite: whether the number may be infinite
     """
-    for name, kind in kinds.items():
+
+    low: float
+    high: float = math.inf
+    whole: bool = False
+    includes_low: bool = True
+    infinite: bool = False
+
+    def allows(self, value: Any) -> bool:
+        """:return: whether the value satisfies the constraint"""
+        if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
+            return False
+        number = float(value)
+        above = number >= self.low if self.includes_low else number > self.low
+        return above and number <= self.high and (self.infinite or math.isfinite(number))
+
+    def __str__(self) -> str:
+        kind = "a whole number" if self.whole else "a number"
+        if self.high < math.inf:
+            return f"{kind} between {self.low:g} and {self.high:g}"
+        return f"{kind} of at least {self.low:g}" if self.includes_low else f"{kind} above {self.low:g}"
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    A constraint: one of several strings.
+
+    :param names: the strings
+    """
+
+    names: tuple[str, ...]
+
+    def allows(self, value: Any) -> bool:
+        """:return: whether the value satisfies the constraint"""
+        return isinstance(value, str) and value in self.names
+
+    def __str__(self) -> str:
+        return f"one of {self.names}"
+
+
+#: The constraints of one argument, of which one must be satisfied; ``None`` among them allows ``None``.
+Constraints = Sequence[Interval | Options | None]
+
+COUNT = Interval(1, whole=True)
+WHOLE = Interval(0, whole=True)
+POSITIVE = Interval(0, includes_low=False, infinite=True)
+NOT_NEGATIVE = Interval(0)
+SHARE = Interval(0, 1)
+
+
+def check_parameters(model: Any) -> None:
+    """
+    Check the attributes that ``_parameter_constraints`` of a model's class and its bases name. A subclass may replace the
+    constraints of its bases.
+
+    :param model: raises ``TypeError`` if one of its attributes does not satisfy its constraints
+    """
+    constraints: dict[str, Constraints] = {}
+    for cls in type(model).__mro__:
+        for name, allowed in vars(cls).get("_parameter_constraints", {}).items():
+            constraints.setdefault(name, allowed)
+    for name, allowed in constraints.items():
         value = getattr(model, name)
-        if value is None and kind.endswith(OR_NONE):
-            continue
-        if not isinstance(value, Real) or isinstance(value, bool) or not _FITS[kind.removesuffix(OR_NONE)](value):
-            raise TypeError(f"{type(model).__name__}: {name} is {value!r}; give {kind}")
-
-
-def check_choices(model: Any, choices: Mapping[str, Sequence[str]]) -> None:
-    """
-    :param model: has them as attributes; raises ``TypeError`` where one is something else
-    :param choices: by name
-    """
-    for name, allowed in choices.items():
-        if getattr(model, name) not in allowed:
-            raise TypeError(f"{type(model).__name__}: {name} is {getattr(model, name)!r}; choose one of {allowed}")
+        if not any(value is None if constraint is None else constraint.allows(value) for constraint in allowed):
+            wanted = ", or ".join(str(constraint) for constraint in allowed)
+            raise TypeError(f"{type(model).__name__}: {name} is {value!r}; give {wanted}")

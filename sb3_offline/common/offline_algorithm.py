@@ -3,6 +3,7 @@
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -16,15 +17,17 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Pr
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
-from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_offline.common.augmentation import has_images, shift_observations
-from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, check_choices, check_numbers
+from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, Constraints, check_parameters
+from sb3_offline.common.learning_data import LearningData
 from sb3_offline.common.process import prepare_process
+from sb3_offline.common.search import LEARNING, SearchSpace
 from sb3_offline.common.stub_env import SpacesOnlyEnv
-from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetSource, OfflineDataset
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
 
@@ -60,17 +63,19 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
     #: whether ``train()`` needs the dataset's action at the next step (an episode's last step is then its own successor)
     needs_next_actions: bool = False
-    #: what the constructor's numbers are to be; a subclass names its own, and in ``choices`` what its texts may be
-    numbers: ClassVar[dict[str, str]] = {
-        "batch_size": COUNT,
-        "tau": SHARE,
-        "gamma": SHARE,
-        "n_steps": COUNT,
-        "target_update_interval": COUNT,
-        "random_shift": WHOLE,
+    #: constraints on the constructor's arguments; a subclass lists those of its own arguments
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "batch_size": [COUNT],
+        "tau": [SHARE],
+        "gamma": [SHARE],
+        "n_steps": [COUNT],
+        "target_update_interval": [COUNT],
+        "random_shift": [WHOLE],
     }
-    _replay_buffer: Any
-    _opened_sources: tuple[Any, ...]
+    #: what a hyperparameter search draws from
+    search_space: ClassVar[SearchSpace] = LEARNING
+    #: what :meth:`values` are called in figures; ``None`` for an algorithm without a critic
+    value_name: ClassVar[str | None] = None
 
     def __init__(
         self,
@@ -92,8 +97,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         seed: int | None = None,
     ):
+        self._data = LearningData(self)  # before SB3's constructor, which sets `replay_buffer`
         if env is None and dataset is not None:
-            opened = open_datasets(dataset)[0]
+            opened = self._data.datasets(dataset)[0]
             env = SpacesOnlyEnv(opened.observation_space, opened.action_space)
         super().__init__(
             policy,
@@ -132,9 +138,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
             raise TypeError(f"{type(self).__name__} needs `dataset=` or `env=` to know its observation and action spaces")
-        for cls in type(self).__mro__:
-            check_numbers(self, vars(cls).get("numbers", {}))
-            check_choices(self, vars(cls).get("choices", {}))
+        check_parameters(self)
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)  # a loaded model keeps the states of its generators
         if self.env is None:
@@ -161,130 +165,69 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     @property
     def replay_buffer(self) -> OfflineReplayBuffer:  # type: ignore[override]
-        """The dataset as SB3's replay buffer; opened at the first use."""
-        pairs = zip(self._data_sources(), self._opened_sources, strict=False)  # nothing was opened at first
-        if self._replay_buffer is None or any(new is not old for new, old in pairs):
-            if self.dataset is None:
-                raise RuntimeError(
-                    f"{type(self).__name__} has no dataset to learn from: pass `dataset=` to the constructor, "
-                    "or `load(path, dataset=...)`"
-                )
-            self.replay_buffer = OfflineReplayBuffer(
-                self.dataset,
-                self.observation_space,
-                self.action_space,
-                device=self.device,
-                n_steps=self.n_steps,
-                gamma=self.gamma,
-                storage=self.dataset_storage,
-                next_actions=self.needs_next_actions,
-                seed=self.seed,
-            )
-            if self._sampler_state is not None:
-                self._replay_buffer.set_rng_state(self._sampler_state)
-            self._prepare_or_forget()
-        return self._replay_buffer
+        """The dataset as SB3's replay buffer. It is opened at the first use, and again if an input was replaced since."""
+        return self._data.open()
 
     @replay_buffer.setter
     def replay_buffer(self, buffer: ReplayBuffer | None) -> None:
-        self._replay_buffer = buffer
-        self._opened_sources = self._data_sources() if buffer is not None else ()
+        self._data.adopt(buffer)
 
     def _open_data(self) -> None:
-        """Open and check all that is learned from."""
-        self.replay_buffer  # noqa: B018
+        """Open and check all inputs before learning starts."""
+        self._data.open()
 
-    def _data_sources(self) -> tuple[Any, ...]:
-        """What the buffer is made of: it is made anew when one of these is replaced."""
+    def _data_inputs(self) -> tuple[Any, ...]:
+        """:return: the attributes that the buffer depends on: the data are opened again after one of these is replaced"""
         return (self.dataset,)
 
-    def _prepare_or_forget(self) -> None:
-        """Prepare the data, or forget the buffer: never learn from data that are half prepared."""
-        try:
-            self._prepare_data()
-        except BaseException:
-            self._replay_buffer = None
-            raise
+    def relabel(self, buffer: OfflineReplayBuffer) -> None:
+        """
+        Replace the rewards of a buffer by those that this algorithm learns from, if it learns from others.
 
-    def _prepare_data(self) -> None:
-        """Called when the dataset was opened, before the first batch is drawn."""
-        self._fit_observation_statistics()
+        :param buffer: over the model's own dataset, or over held-out data
+        """
 
-    def _fit_observation_statistics(self) -> None:
-        normalize = self._vec_normalize_env
-        self._check_normalizer(normalize)
-        self._observations_normalized = _normalizes(normalize)
-        if normalize is None or not normalize.norm_obs:
-            self.policy.fit_observation_statistics(self._replay_buffer.observation_statistics)  # type: ignore[operator]
-        elif normalize.training:
-            # Without a rollout, the running statistics of a VecNormalize have to come from the dataset.
-            statistics = self._replay_buffer.observation_statistics()
-            running = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
-            for key, rms in running.items():
-                rms.mean, rms.var, rms.count = statistics[key] if key else statistics
-
-    def _check_normalizer(self, normalize: VecNormalize | None) -> None:
-        """Raise where the policy was fitted to other observations than these."""
-        if _normalizes(normalize) and self.policy.standardizes:  # type: ignore[operator]
-            raise RuntimeError(
-                "The policy was fitted to plain observations, but the environment is a VecNormalize that normalises them; "
-                "use the environment without it, or train a new model with it"
-            )
-        if self._observations_normalized and not _normalizes(normalize):
-            raise RuntimeError(
-                "The policy was fitted to observations that a VecNormalize normalised, and the environment is none; "
-                "give that one: set_env, or load(path, env=...)"
-            )
+    def _on_data_opened(self, buffer: OfflineReplayBuffer) -> None:
+        """Called when the data are open, fitted and relabelled, before the first batch is drawn."""
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        if self._replay_buffer is not None:  # before it is taken
-            self._check_normalizer(unwrap_vec_normalize(env))  # type: ignore[arg-type]
-        normalize, buffer = self._vec_normalize_env, self._replay_buffer
+        if self._data.buffer is not None:  # before the environment is replaced
+            self._data.check_normalizer(unwrap_vec_normalize(env))  # type: ignore[arg-type]
+        normalizer = self._vec_normalize_env
         super().set_env(env, force_reset)
-        if buffer is None or self._vec_normalize_env is normalize:
-            return
-        # What was made with the other normaliser is made anew
-        rewards = buffer.rewards
-        buffer.restore_rewards()
-        self._prepare_or_forget()
-        if not buffer.is_relabelled:
-            buffer.rewards = rewards  # of load_replay_buffer
+        if self._vec_normalize_env is not normalizer:
+            self._data.prepare_again()
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
         if seed is None:
             return
-        # Not as a saved model would have gone on, but anew
+        # The model starts anew instead of going on as the saved one would have
         self._torch_rng_state, self._sampler_state = None, dict(np.random.default_rng(seed).bit_generator.state)
-        if self._replay_buffer is not None:
-            self._replay_buffer.set_rng_state(self._sampler_state)
+        self._data.restore_generator()
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """
-        Take from a saved buffer where it was in its data, if these are the model's own; and which data, if the model has none.
+        Go on from a saved buffer: with its place in the data, if it is over the model's own dataset, or with its dataset,
+        if the model has none.
 
-        :param path: of the file that ``save_replay_buffer`` wrote. One of an online algorithm of SB3 is a dataset: a model
-            that has none takes it
+        :param path: of the file that ``save_replay_buffer`` wrote. A buffer of an online algorithm of SB3 is a dataset, which
+            a model without a dataset takes
         :param truncate_last_traj: see :class:`~stable_baselines3.common.off_policy_algorithm.OffPolicyAlgorithm`
         """
         super().load_replay_buffer(path, truncate_last_traj)
-        saved, self.replay_buffer = self._replay_buffer, None
+        saved, self.replay_buffer = self._data.buffer, None
         if not isinstance(saved, OfflineReplayBuffer):
             if self.dataset is not None or not isinstance(path, str | PathLike):
-                problem = f"is a {type(saved).__name__}, in which this model has no place to go on from"
+                problem = f"is a {type(saved).__name__}, which holds no place in this model's dataset to go on from"
                 raise DatasetError(path, "replay buffer", problem, "Learn from it: dataset=PATH")
             self.dataset = path if Path(path).suffix else f"{path}.pkl"
             self._open_data()
             return
         if self.dataset is None:
             self.dataset = saved.datasets
-        own = self.replay_buffer
-        if not np.array_equal(own.actions, saved.actions):
-            warnings.warn(f"{path}: is of other data than the model's dataset, which is learned from; it is not used.")
-            return
-        own.set_rng_state(saved.get_rng_state())
-        if saved.is_relabelled and not own.is_relabelled:
-            own.rewards = saved.rewards
+        if not self._data.go_on_from(saved):
+            warnings.warn(f"{path}: is over other data than the model's dataset; the model goes on with its own dataset.")
 
     def augment(self, observations: PyTorchObs, max_shift: int | None = None) -> PyTorchObs:
         """
@@ -295,6 +238,41 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         max_shift = self.random_shift if max_shift is None else max_shift
         images_are_floats = not self.policy.normalize_images
         return shift_observations(observations, self.observation_space, max_shift, self.replay_buffer.rng, images_are_floats)
+
+    # ------------------------------------------------- answers about the model
+
+    def default_callbacks(self) -> list[BaseCallback]:
+        """:return: new callbacks that every training of this algorithm should have"""
+        return []
+
+    def values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor | None:
+        """
+        What the critics make of actions, in the unit that :attr:`value_name` names. No gradient.
+
+        :param observations: a batch, as the buffer gives it
+        :param actions: ``(batch, action_dim)`` in [-1, 1]
+        :return: the lowest of the critics, ``(batch,)``; ``None`` without a critic
+        """
+        return None
+
+    def td_errors(self, batch: OfflineSamples) -> th.Tensor | None:
+        """
+        Errors of the critics in the Bellman equation of the learned policy. No gradient.
+
+        :param batch: transitions
+        :return: absolute errors, the mean over the critics, ``(batch,)``; ``None`` without a critic
+        """
+        return None
+
+    def success_probabilities(self, observations: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor | None:
+        """
+        What a classifier of success makes of observations. No gradient.
+
+        :param observations: a batch, as the buffer gives it
+        :param actions: ``(batch, action_dim)`` in [-1, 1]; default: the policy's
+        :return: probabilities, ``(batch,)``; ``None`` for an algorithm without such a classifier
+        """
+        return None
 
     # -------------------------------------------------------------- learning
 
@@ -408,9 +386,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     # ---------------------------------------------------------------- saving
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        if self._replay_buffer is not None:
-            self._sampler_state = self._replay_buffer.get_rng_state()
-        # With these, a loaded model goes on as this one would: actions are drawn by PyTorch's generator of the device.
+        if self._data.buffer is not None:
+            self._sampler_state = self._data.buffer.get_rng_state()
+        # With these, a loaded model goes on as this one would: PyTorch's generator of the device draws the actions.
         self._torch_rng_state = th.get_rng_state()
         self._cuda_rng_state = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         super().save(path, exclude, include)
@@ -441,18 +419,13 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         return model
 
     def _excluded_save_params(self) -> list[str]:
-        excluded = [*super()._excluded_save_params(), "actor", "_replay_buffer", "_opened_sources", "_metrics"]
-        # An open dataset would be opened again by `load`, even to predict; paths are kept, so that it can go on learning.
+        excluded = [*super()._excluded_save_params(), "actor", "_data", "_metrics"]
+        # `load` would open a saved dataset again, even to predict. Paths are kept, so that a loaded model can go on learning.
         parts = self.dataset if isinstance(self.dataset, list | tuple) else [self.dataset]
         return [*excluded, "dataset"] if any(isinstance(part, OfflineDataset) for part in parts) else excluded
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer"], []
-
-
-def _normalizes(normalize: VecNormalize | None) -> bool:
-    """:return: whether an environment normalises observations"""
-    return normalize is not None and normalize.norm_obs
 
 
 class _GradientStepBar(ProgressBarCallback):

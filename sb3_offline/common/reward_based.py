@@ -1,4 +1,4 @@
-"""What algorithms share that learn from rewards."""
+"""The base of the algorithms that learn from rewards."""
 
 from collections.abc import Callable
 from typing import Any
@@ -45,23 +45,17 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
             raise TypeError(f"{type(self).__name__}: reward_fn is {reward_fn!r}; give a function, or 'success'")
         self.reward_fn = reward_fn
 
-    def _data_sources(self) -> tuple[Any, ...]:
-        return (*super()._data_sources(), self.reward_fn)
+    def _data_inputs(self) -> tuple[Any, ...]:
+        return (*super()._data_inputs(), self.reward_fn)
 
-    def _prepare_data(self) -> None:
-        super()._prepare_data()
-        self.relabel(self.replay_buffer)
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.norm_reward and normalize.training:
-            # Without a rollout, the scale of a VecNormalize has to come from the dataset.
-            normalize.ret_rms.var = np.array(self.replay_buffer.return_variance(normalize.gamma))
+    def _on_data_opened(self, buffer: OfflineReplayBuffer) -> None:
+        super()._on_data_opened(buffer)
+        normalizer = self._vec_normalize_env
+        if normalizer is not None and normalizer.norm_reward and normalizer.training:
+            # No rollout fits the scale of a VecNormalize here, so it comes from the dataset
+            normalizer.ret_rms.var = np.array(buffer.return_variance(normalizer.gamma))
 
     def relabel(self, buffer: OfflineReplayBuffer) -> None:
-        """
-        Put the rewards that this algorithm learns from in place of a dataset's.
-
-        :param buffer: over the model's own dataset, or over another one, to judge the model by
-        """
         if callable(self.reward_fn):
             buffer.relabel(self.reward_fn)
         elif self.reward_fn is not None:
@@ -72,16 +66,12 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
 
     def _returns(self, batch: OfflineSamples) -> tuple[th.Tensor, th.Tensor, PyTorchObs]:
         """
-        What a target is made of: ``rewards + discounts * value(observations)``.
+        The parts of a target ``rewards + discounts * value(observations)`` over the longest horizon.
 
         :param batch: transitions
-        :return: rewards of ``n_steps`` steps, discounted, ``(batch,)``; discounts, 0 where the episode terminated,
-            ``(batch,)``; and observations after these steps, shifted as in training
+        :return: discounted sums of ``n_steps`` rewards, ``(batch,)``; discounts, 0 where the episode terminated,
+            ``(batch,)``; and the observations after these steps, shifted as in training
         """
-        if self.n_steps == 1:
-            rewards, dones, discounts = batch.rewards, batch.dones, batch.discounts
-            observations = batch.next_observations
-        else:
-            rewards, dones, discounts = batch.nstep_rewards, batch.nstep_dones, batch.nstep_discounts  # type: ignore
-            observations = batch.nstep_observations  # type: ignore[assignment]
-        return rewards.squeeze(1), (discounts * (1 - dones)).squeeze(1), self.augment(observations)
+        horizon = batch.horizons[-1]
+        discounts = horizon.discounts * (1 - horizon.dones)
+        return horizon.rewards.squeeze(1), discounts.squeeze(1), self.augment(horizon.observations)

@@ -1,6 +1,7 @@
 """CQL: Conservative Q-Learning."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
@@ -8,9 +9,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
-from sb3_offline.common.hyperparameters import COUNT
+from sb3_offline.common.hyperparameters import COUNT, Constraints
 from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, log_uniform
 from sb3_offline.cql.losses import conservative_gaps
 from sb3_offline.data.reader import DatasetSource
 
@@ -22,8 +24,8 @@ ALPHA_MAX = 1e6
 
 class CQL(RewardBasedAlgorithm):
     """
-    Conservative Q-Learning (CQL, https://arxiv.org/abs/2006.04779): soft actor-critic whose critics hold down the values of
-    actions that the dataset does not have::
+    Conservative Q-Learning (CQL, https://arxiv.org/abs/2006.04779): soft actor-critic with a penalty that holds down the
+    values of actions outside the dataset::
 
         y = r + gamma (1 - terminated) min_i Qbar_i(s', a'),    a' ~ pi(s')
         critic:  min  sum_i E_D[(Q_i(s, a) - y)^2] + cql_alpha E_D[log int exp(Q_i(s, a)) da - Q_i(s, a)]
@@ -40,9 +42,9 @@ class CQL(RewardBasedAlgorithm):
     :param gamma: the discount factor
     :param n_steps: steps of rewards before the target's value (1: as above)
     :param cql_alpha: weight of the conservative term. ``"auto"`` (or ``"auto_0.5"``, for 0.5 as initial value) learns it by
-        dual gradient descent, so that the term comes to ``cql_target_gap``
-    :param cql_target_gap: how far the soft maximum over sampled actions may lie above the data's values, in each critic, when
-        learning ``cql_alpha`` (``lagrange_threshold`` in the authors' code)
+        dual gradient descent, so that the term comes to ``lagrange_threshold``
+    :param lagrange_threshold: how far the soft maximum over sampled actions may lie above the data's values, in each critic,
+        when learning ``cql_alpha``
     :param n_action_samples: K
     :param ent_coef: Entropy coefficient. ``"auto"`` (or ``"auto_0.1"``, for 0.1 as initial value) learns it
     :param target_entropy: target entropy when learning ``ent_coef``; ``"auto"`` is minus the number of action dimensions
@@ -60,7 +62,8 @@ class CQL(RewardBasedAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
-    numbers: ClassVar[dict[str, str]] = {"n_action_samples": COUNT}
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {"n_action_samples": [COUNT]}
+    search_space: ClassVar[SearchSpace] = {**BOOTSTRAPPING, "cql_alpha": log_uniform(0.05, 20)}
     log_ent_coef: th.Tensor
     log_cql_alpha: th.Tensor
     ent_coef_optimizer: th.optim.Adam | None
@@ -77,7 +80,7 @@ class CQL(RewardBasedAlgorithm):
         gamma: float = 0.99,
         n_steps: int = 1,
         cql_alpha: float | str = 5.0,
-        cql_target_gap: float = 10.0,
+        lagrange_threshold: float = 10.0,
         n_action_samples: int = 10,
         ent_coef: float | str = "auto",
         target_entropy: float | str = "auto",
@@ -114,7 +117,7 @@ class CQL(RewardBasedAlgorithm):
             seed=seed,
         )
         self.cql_alpha = cql_alpha
-        self.cql_target_gap = cql_target_gap
+        self.lagrange_threshold = lagrange_threshold
         self.n_action_samples = n_action_samples
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
@@ -218,7 +221,7 @@ class CQL(RewardBasedAlgorithm):
         """
         if self.cql_alpha_optimizer is None:
             return self.log_cql_alpha.exp().squeeze() * gaps.sum()
-        excess = gaps - self.cql_target_gap
+        excess = gaps - self.lagrange_threshold
         alpha_loss = -self.log_cql_alpha.exp().clamp(max=ALPHA_MAX).squeeze() * excess.detach().sum()
         self._optimize(self.cql_alpha_optimizer, alpha_loss)
         alpha = self.log_cql_alpha.detach().exp().clamp(max=ALPHA_MAX).squeeze()
@@ -228,14 +231,14 @@ class CQL(RewardBasedAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         learned = [name for name in ("ent_coef", "cql_alpha") if getattr(self, f"{name}_optimizer") is not None]
-        # A fixed one is an attribute, which `load` may replace
+        # A fixed coefficient is an attribute, which `load` may replace
         return [*state_dicts, *(f"{name}_optimizer" for name in learned)], [*variables, *(f"log_{name}" for name in learned)]
 
     @classmethod
     def load(cls: type[SelfCQL], path: Any, *args: Any, **kwargs: Any) -> SelfCQL:  # type: ignore[override]
         """
-        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. Fixed coefficients stay fixed, and learned ones
-        learned, from where they were.
+        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. A coefficient that was learned goes on being
+        learned from its saved value, and a fixed one stays fixed: ``TypeError`` otherwise.
         """
         for name in kwargs.keys() & {"ent_coef", "cql_alpha"}:
             was_learned = f"{name}_optimizer" in load_from_zip_file(path, device="cpu", load_data=False)[1]

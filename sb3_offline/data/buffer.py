@@ -22,23 +22,37 @@ STATISTICS_BYTES = 1 << 24
 Observations = th.Tensor | TensorDict
 
 
+class Horizon(NamedTuple):
+    """
+    The outcome of B transitions after n' steps, where n' is smaller than asked for if an episode ends earlier.
+
+    :param observations: observations after the n' steps, as ``OfflineSamples.observations``
+    :param rewards: (B, 1) float, the sum of ``gamma ** k * reward`` over the n' steps
+    :param dones: (B, 1) float, 1 where the last of the n' steps terminated
+    :param discounts: (B, 1) ``gamma ** n'``
+    :param next_actions: (B, A) the dataset's actions in ``observations``, if the buffer gives next actions
+    """
+
+    observations: Observations
+    rewards: th.Tensor
+    dones: th.Tensor
+    discounts: th.Tensor
+    next_actions: th.Tensor | None = None
+
+
 class OfflineSamples(NamedTuple):
     """
-    A batch of B transitions; the first six fields are those of SB3's ``ReplayBufferSamples``, for one step.
+    A batch of B transitions. The first six fields are those of SB3's ``ReplayBufferSamples``, for one step.
 
     :param observations: ``(B, *shape)``, channel-first images as a channels-last view of uint8
     :param actions: (B, A) scaled to [-1, 1]
     :param next_observations: as ``observations``
-    :param dones: (B, 1) float, 1 where the step terminated; never where it was only truncated
+    :param dones: (B, 1) float, 1 where the step terminated; 0 where it was only truncated
     :param rewards: (B, 1) float, zeros where the files have none
     :param discounts: (B, 1) gamma
-    :param next_actions: (B, A) the dataset's action in the next observation, if asked for
-    :param nstep_observations: observation after n' = min(n_steps, steps left in the window's episode) steps; for n_steps > 1
-    :param nstep_actions: (B, A) the dataset's action there, if next actions are asked for
-    :param nstep_discounts: (B, 1) gamma ** n'
-    :param nstep_rewards: (B, 1) sum of gamma ** k * reward over the n' steps
-    :param nstep_dones: (B, 1) float, 1 where the last of the n' steps terminated
-    :param steps: (B,) int64 on the CPU, numbers of the transitions, as :meth:`OfflineReplayBuffer.transitions` takes them
+    :param horizons: the transitions' outcomes: after 1 step, and after ``n_steps`` steps if the buffer's ``n_steps`` is
+        above 1. The last one is the longest.
+    :param indices: (B,) int64 on the CPU, indices of the transitions for :meth:`OfflineReplayBuffer.transitions`
     """
 
     observations: Observations
@@ -47,33 +61,28 @@ class OfflineSamples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor
-    next_actions: th.Tensor | None = None
-    nstep_observations: Observations | None = None
-    nstep_actions: th.Tensor | None = None
-    nstep_discounts: th.Tensor | None = None
-    nstep_rewards: th.Tensor | None = None
-    nstep_dones: th.Tensor | None = None
-    steps: th.Tensor | None = None
+    horizons: tuple[Horizon, ...] = ()
+    indices: th.Tensor | None = None
 
 
 class OfflineReplayBuffer(ReplayBuffer):
     """
     A fixed ``ReplayBuffer`` over one or several dataset files.
 
-    It samples uniformly over steps with its own random generator. Windows of several steps never cross an episode. It
-    pickles as its files' paths, its generator, and its rewards where they were relabelled.
+    It samples steps uniformly with its own random generator. Windows of several steps never cross an episode. It pickles as
+    the paths of its files, the state of its generator, and the relabelled rewards, if any.
 
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these
     :param observation_space: the learner's space: as in the files, or with images channel-first
     :param action_space: the learner's action space; must be that of the files
     :param device: where samples go
-    :param n_steps: length of the windows of the ``nstep_...`` fields, which exist for n_steps > 1
+    :param n_steps: length of the second horizon of a batch, which exists for n_steps > 1
     :param gamma: discount of one step
     :param storage: "memory", "mmap" (contiguous files only), or "auto": the latter where the observations would take more than
         half of the available memory
-    :param next_actions: give the dataset's next actions too. The last step of an episode has none: windows end at it, and it
-        is its own successor. So every pair of observation and action that a learner bootstraps from is also one that it
-        trains on; leaving the last steps out would make them values that nothing holds down
+    :param next_actions: whether to give the dataset's next actions. The last step of an episode has no next action, so windows
+        end at it, and it is its own successor. Thus a learner bootstraps only from pairs of observation and action that it
+        also trains on. If the last steps were left out, their values would be bootstrapped but never trained
     :param seed: seed of the generator
     """
 
@@ -176,26 +185,32 @@ class OfflineReplayBuffer(ReplayBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
         return self.transitions(batch_inds, env)  # the name that SB3 knows
 
-    def transitions(self, steps: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:
+    def transitions(self, indices: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:
         """
-        :param steps: (B,) step numbers below ``size()``, counted through all files in their order
+        :param indices: (B,) indices of steps below ``size()``, counted through all files in their order
         :param env: normalises observations and rewards
         :return: these transitions, in this order
         """
-        rows = self._observation_rows[steps]
-        one = np.minimum(1, self._steps_left[steps])
-        samples = OfflineSamples(
-            observations=self._observations(rows, env),
-            actions=self._to_device(self.actions.take(steps, axis=0)),
-            next_observations=self._observations(rows + one, env),
-            dones=self._column(self.dones[steps]),
-            rewards=self._column(self._normalize_reward(self.rewards[steps], env)),
-            discounts=self._column(np.full(len(steps), self.gamma)),
-            steps=th.as_tensor(steps),
+        rows = self._observation_rows[indices]
+        following = np.minimum(1, self._steps_left[indices])  # 0 where the last step of an episode is its own successor
+        observations = self._observations(rows, env)
+        one_step = Horizon(
+            observations=self._observations(rows + following, env),
+            rewards=self._column(self._normalize_reward(self.rewards[indices], env)),
+            dones=self._column(self.dones[indices]),
+            discounts=self._column(np.full(len(indices), self.gamma)),
+            next_actions=self._scaled_actions_at(indices + following) if self.next_actions else None,
         )
-        if self.next_actions:
-            samples = samples._replace(next_actions=self._to_device(self.actions.take(steps + one, axis=0)))
-        return samples._replace(**self._windows(steps, rows, env)) if self.n_steps > 1 else samples
+        return OfflineSamples(
+            observations=observations,
+            actions=self._scaled_actions_at(indices),
+            next_observations=one_step.observations,
+            dones=one_step.dones,
+            rewards=one_step.rewards,
+            discounts=one_step.discounts,
+            horizons=(one_step, self._window(indices, rows, env)) if self.n_steps > 1 else (one_step,),
+            indices=th.as_tensor(indices),
+        )
 
     def single_steps(self) -> "OfflineReplayBuffer":
         """
@@ -206,31 +221,32 @@ class OfflineReplayBuffer(ReplayBuffer):
         other._index_steps(np.concatenate([dataset.lengths for dataset in self.datasets]))
         return other
 
-    def pairs(self, steps: np.ndarray, env: VecNormalize | None = None) -> tuple[Observations, th.Tensor]:
+    def pairs(self, indices: np.ndarray, env: VecNormalize | None = None) -> tuple[Observations, th.Tensor]:
         """
-        :param steps: (B,) step numbers, as for :meth:`transitions`
+        :param indices: (B,) indices of steps, as for :meth:`transitions`
         :param env: normalises observations
         :return: ``observations`` and ``actions`` of these transitions
         """
-        actions = self._to_device(self.actions.take(steps, axis=0))
-        return self._observations(self._observation_rows[steps], env), actions
+        return self._observations(self._observation_rows[indices], env), self._scaled_actions_at(indices)
 
-    def _windows(self, steps: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        ahead = np.minimum(self.n_steps, self._steps_left[steps])
-        n = np.maximum(ahead, 1)
+    def _scaled_actions_at(self, indices: np.ndarray) -> th.Tensor:
+        return self._to_device(self.actions.take(indices, axis=0))
+
+    def _window(self, indices: np.ndarray, rows: np.ndarray, env: VecNormalize | None) -> Horizon:
+        """:return: the outcome after ``n_steps`` steps, or at the end of the episode"""
+        following = np.minimum(self.n_steps, self._steps_left[indices])
+        n = np.maximum(following, 1)
         offsets = np.arange(self.n_steps)
         inside = offsets < n[:, None]
-        window = steps[:, None] + np.where(inside, offsets, 0)  # outside: any valid row, since its reward is masked
+        window = indices[:, None] + np.where(inside, offsets, 0)  # rewards outside are masked, so any valid index will do
         rewards = self._normalize_reward(self.rewards[window], env) * inside * self.gamma**offsets
-        fields = {
-            "nstep_observations": self._observations(rows + ahead, env),
-            "nstep_discounts": self._column(self.gamma**n),
-            "nstep_rewards": self._column(rewards.sum(axis=1)),
-            "nstep_dones": self._column(self.dones[steps + n - 1]),
-        }
-        if self.next_actions:
-            fields["nstep_actions"] = self._to_device(self.actions.take(steps + ahead, axis=0))
-        return fields
+        return Horizon(
+            observations=self._observations(rows + following, env),
+            rewards=self._column(rewards.sum(axis=1)),
+            dones=self._column(self.dones[indices + n - 1]),
+            discounts=self._column(self.gamma**n),
+            next_actions=self._scaled_actions_at(indices + following) if self.next_actions else None,
+        )
 
     def _observations(self, rows: np.ndarray, env: VecNormalize | None) -> Observations:
         parts = {}
@@ -293,13 +309,13 @@ class OfflineReplayBuffer(ReplayBuffer):
         n_steps, self.n_steps = self.n_steps, 1  # no windows: they would only read more frames
         try:
             for first in range(0, self.buffer_size, batch_size):
-                steps = np.arange(first, min(first + batch_size, self.buffer_size))
+                indices = np.arange(first, min(first + batch_size, self.buffer_size))
                 with th.no_grad():
-                    values = th.as_tensor(reward_fn(self.transitions(steps, env))).to("cpu", th.float32)
-                if values.shape not in ((len(steps),), (len(steps), 1)) or not values.isfinite().all():
-                    problem = f"gave {values} of shape {tuple(values.shape)} for {len(steps)} transitions"
+                    values = th.as_tensor(reward_fn(self.transitions(indices, env))).to("cpu", th.float32)
+                if values.shape not in ((len(indices),), (len(indices), 1)) or not values.isfinite().all():
+                    problem = f"gave {values} of shape {tuple(values.shape)} for {len(indices)} transitions"
                     raise DatasetError("", "reward_fn", problem, "Return one finite number for each transition")
-                rewards[steps] = values.flatten().numpy()
+                rewards[indices] = values.flatten().numpy()
         finally:
             self.n_steps = n_steps
         self.rewards = rewards

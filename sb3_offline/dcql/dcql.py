@@ -1,5 +1,6 @@
 """d-CQL: CQL on the distance to goals."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch as th
@@ -7,7 +8,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
-from sb3_offline.common.hyperparameters import POSITIVE
+from sb3_offline.common.hyperparameters import POSITIVE, Constraints, Options
+from sb3_offline.common.search import Choice, SearchSpace, log_uniform
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.reader import DatasetSource
@@ -16,7 +18,7 @@ from sb3_offline.dcql.distances import ObservationVectors, mean_distance
 
 class DCQL(ExampleBasedAlgorithm, CQL):
     """
-    CQL with a naive reward (d-CQL): minus the mean distance between an observation and the success examples::
+    CQL with a naive reward (d-CQL), the negative mean distance between an observation and the success examples::
 
         r(s) = -reward_scale E_{s* ~ S*}[|s - s*|]
 
@@ -24,8 +26,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: see :class:`~sb3_offline.cql.cql.CQL`
-    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; rewards in it are not looked at
-    :param examples: Success examples S*: a folder of pictures, an ``.npz`` or HDF5 file, or an array of observations. All of
+    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; its rewards are not used
+    :param examples: Success examples S*: a folder of images, an ``.npz`` or HDF5 file, or an array of observations. All of
         them are goals.
     :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
     :param distance: ``"l2"``, the Euclidean norm of the difference, or ``"mse"``, the mean of its squares
@@ -35,8 +37,16 @@ class DCQL(ExampleBasedAlgorithm, CQL):
     :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
     """
 
-    numbers: ClassVar[dict[str, str]] = {"reward_scale": POSITIVE}
-    choices: ClassVar[dict[str, tuple[str, ...]]] = {"distance": ("l2", "mse")}
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "distance": [Options(("l2", "mse"))],
+        "reward_scale": [POSITIVE],
+    }
+    search_space: ClassVar[SearchSpace] = {
+        **CQL.search_space,
+        "ent_coef": log_uniform(1e-5, 0.1),
+        "distance": Choice("l2", "mse"),
+        "reward_scale": log_uniform(1e-3, 10),
+    }
 
     def __init__(
         self,
@@ -52,9 +62,9 @@ class DCQL(ExampleBasedAlgorithm, CQL):
         **kwargs: Any,
     ):
         if "reward_fn" in kwargs:
-            raise TypeError("DCQL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
+            raise TypeError("DCQL makes its rewards from the examples; for other rewards use CQL(..., reward_fn=...)")
         if "example_batch_size" in kwargs:
-            raise TypeError("DCQL compares with all of the examples, so it has no example_batch_size; leave it out")
+            raise TypeError("DCQL compares each observation with all examples, so it has no example_batch_size; leave it out")
         self.distance = distance
         self.reward_scale = reward_scale
         super().__init__(
@@ -68,8 +78,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
             **kwargs,
         )
 
-    def _data_sources(self) -> tuple[Any, ...]:
-        return (*super()._data_sources(), self.examples)
+    def _data_inputs(self) -> tuple[Any, ...]:
+        return (*super()._data_inputs(), self.examples)
 
     def relabel(self, buffer: OfflineReplayBuffer) -> None:
         statistics = None if self._observations_normalized else self.replay_buffer.observation_statistics

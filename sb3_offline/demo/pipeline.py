@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 
 import sb3_offline
-from sb3_offline.ceborl import CEBORL
+from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data_tools.collect_scripted import BEHAVIOUR, TASKS, collect_scripted
@@ -93,7 +93,7 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
         rows.append(result_row(method, settings, config["n_timesteps"], settings.n_final_episodes, sum(result.successes)))
         if method == "CEBORL":
             print("Recording the policy and its classifier")
-            assert isinstance(model, CEBORL)
+            assert isinstance(model, RecursiveClassifier)
             record_gif(model, ENV_ID, env_kwargs, output / "policy.gif")
             judged = judge_trajectories(model, OfflineDataset(data["judged"]))
             plots.plot_classifier(judged, pick_trajectories(judged), output / "classifier.png")

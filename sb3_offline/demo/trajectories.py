@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch as th
 
-from sb3_offline.ceborl import CEBORL
+from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.reader import OfflineDataset
 
@@ -30,7 +30,7 @@ class JudgedTrajectories:
 
 
 @th.no_grad()
-def judge_trajectories(model: CEBORL, dataset: OfflineDataset) -> JudgedTrajectories:
+def judge_trajectories(model: RecursiveClassifier, dataset: OfflineDataset) -> JudgedTrajectories:
     """
     :param model: gives the classifier
     :param dataset: episodes of equal length, with the extra ``scene_state``

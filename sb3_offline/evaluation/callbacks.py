@@ -1,26 +1,20 @@
 """A callback that judges a learner by held-out data."""
 
-from typing import Any
-
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_offline.ceborl import CEBORL
-from sb3_offline.ceborl.losses import success_odds
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.example_based import ExampleSource
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
-from sb3_offline.common.reward_based import RewardBasedAlgorithm
-from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
+from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.evaluation.fitted_q import batches_of, first_steps, fitted_q_evaluation, state_values
 from sb3_offline.evaluation.metrics import judge_probabilities, success_to_come
-from sb3_offline.oril import ORIL
 
 
 class OfflineEvalCallback(BaseCallback):
@@ -70,11 +64,10 @@ class OfflineEvalCallback(BaseCallback):
             self.buffer = OfflineReplayBuffer(
                 self.dataset, model.observation_space, model.action_space, model.device, gamma=model.gamma
             )
-            if isinstance(model, RewardBasedAlgorithm):
-                model.relabel(self.buffer)
+            model.relabel(self.buffer)
         size = self.buffer.size()
         n = min(self.n_transitions, size)
-        self.steps = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
+        self.indices = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
         self.example_observations: PyTorchObs | None = None
         if self.examples is not None:
             arrays = load_examples(self.examples, model.observation_space)
@@ -100,57 +93,41 @@ class OfflineEvalCallback(BaseCallback):
         if isinstance(model, ActorCriticAlgorithm):
             initial = state_values(model.critic, model, self.buffer, first_steps(self.buffer))
             found |= {"initial_value": float(initial.mean()), "initial_value_std": float(initial.std())}
-            batches = batches_of(self.buffer, self.steps, model._vec_normalize_env)
-            found["td_error"] = float(np.concatenate([self._td_errors(batch) for batch in batches]).mean())
-        if isinstance(model, CEBORL | ORIL):
-            found |= self._judge_classifier()
+            batches = batches_of(self.buffer, self.indices, model._vec_normalize_env)
+            found["td_error"] = float(np.concatenate([_numpy(model.td_errors(batch)) for batch in batches]).mean())
+        found |= self._judge_classifier()
         if self.buffer.has_rewards:
             found["data_return"] = float(discounted_returns(self.buffer, model.gamma, model._vec_normalize_env).mean())
             if self.fqe_steps:
                 found["fqe_value"] = float(fitted_q_evaluation(model, self.buffer, self.fqe_steps).mean())
         return found
 
-    @th.no_grad()
-    def _td_errors(self, batch: OfflineSamples) -> np.ndarray:
-        model: Any = self.model
-        values = model.critic.values(model.critic.encode(batch.observations), batch.actions)
-        actions = model.policy._predict(batch.next_observations, deterministic=True)
-        following = model.critic_target.values(model.critic_target.encode(batch.next_observations), actions)
-        if isinstance(model, CEBORL):
-            omega = model.gamma * success_odds(following, model.omega_max)
-            errors = values.sigmoid() - omega / (1 + omega)
-        else:
-            discounts = model.gamma * (1 - batch.dones.squeeze(1))
-            errors = values - (batch.rewards.squeeze(1) + discounts * following.amin(dim=0))
-        return errors.abs().mean(dim=0).float().cpu().numpy()
-
     def _judge_classifier(self) -> dict[str, float]:
+        """:return: how well the model's classifier of success does; nothing if it has none"""
         found: dict[str, float] = {}
-        batches = list(batches_of(self.buffer, self.steps, self.model._vec_normalize_env))
-        of_data = np.concatenate([self._probabilities(batch.observations, batch.actions) for batch in batches])
+        probabilities = []
+        for batch in batches_of(self.buffer, self.indices, self.model._vec_normalize_env):
+            of_batch = self.model.success_probabilities(batch.observations, batch.actions)
+            if of_batch is None:
+                return found
+            probabilities.append(_numpy(of_batch))
+        of_data = np.concatenate(probabilities)
         if self.example_observations is not None:
-            of_examples = self._probabilities(self.example_observations, None)
+            of_examples = _numpy(self.model.success_probabilities(self.example_observations))
             labels = np.append(np.ones(len(of_examples), dtype=bool), np.zeros(len(of_data), dtype=bool))
             judged = judge_probabilities(np.append(of_examples, of_data), labels)
             found |= {f"examples_{name}": value for name, value in judged.items()}
         datasets = self.buffer.datasets
         if all(dataset.success is not None for dataset in datasets):
-            labels = np.concatenate([success_to_come(np.asarray(d.success), d.lengths) for d in datasets])[self.steps]
+            labels = np.concatenate([success_to_come(np.asarray(d.success), d.lengths) for d in datasets])[self.indices]
             if labels.any() and not labels.all():
                 found |= {f"success_{name}": value for name, value in judge_probabilities(of_data, labels).items()}
         return found
 
-    @th.no_grad()
-    def _probabilities(self, observations: PyTorchObs, actions: th.Tensor | None) -> np.ndarray:
-        """The probability of success; without actions with those of the policy."""
-        model: Any = self.model
-        if isinstance(model, ORIL):
-            model.reward_model.set_training_mode(False)
-            return model.reward_model(observations).sigmoid().float().cpu().numpy()
-        if actions is None:
-            actions = model.policy._predict(observations, deterministic=True)
-        logits = model.critic.values(model.critic.encode(observations), actions).amin(dim=0)
-        return logits.sigmoid().float().cpu().numpy()
+
+def _numpy(tensor: th.Tensor | None) -> np.ndarray:
+    assert tensor is not None
+    return tensor.float().cpu().numpy()
 
 
 def discounted_returns(buffer: OfflineReplayBuffer, gamma: float, env: VecNormalize | None = None) -> np.ndarray:

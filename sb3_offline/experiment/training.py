@@ -16,7 +16,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_offline
-from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
 from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.files import replacing
@@ -285,8 +284,7 @@ def train(
         if eval_freq > 0:
             _check_playable(model, env_id, config["env_kwargs"])
         all_callbacks.insert(0, _ReplaceEarlierRun(output, record))
-    if isinstance(model, CEBORL):
-        all_callbacks.append(DiagnosticsCallback())
+    all_callbacks += model.default_callbacks()
     if save_freq:
         all_callbacks.append(_SaveForResume(resume_file, save_freq))
     n_timesteps = config["n_timesteps"] - model.num_timesteps

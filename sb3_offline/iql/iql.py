@@ -1,21 +1,23 @@
 """IQL: Implicit Q-Learning."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE
+from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE, Constraints
 from sb3_offline.common.losses import bellman_loss, effective_share, expectile_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform, log_uniform
 from sb3_offline.data.reader import DatasetSource
-from sb3_offline.iql.losses import advantage_weights
+from sb3_offline.iql.losses import exponential_weights
 
 
 class IQL(RewardBasedAlgorithm):
     """
-    Implicit Q-Learning (IQL, https://arxiv.org/abs/2110.06169): never values an action that the dataset does not have::
+    Implicit Q-Learning (IQL, https://arxiv.org/abs/2110.06169) never evaluates an action outside the dataset::
 
         value:   min  E_D[L(min_i Qbar_i(s, a) - V(s))],    L(u) = |expectile - 1(u < 0)| u^2
         critic:  min  sum_i E_D[(Q_i(s, a) - r - gamma (1 - terminated) V(s'))^2]
@@ -29,10 +31,10 @@ class IQL(RewardBasedAlgorithm):
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor
     :param n_steps: steps of rewards before the target's value (1: as above)
-    :param expectile: of the values of the data's actions that V(s) is: 0.5 for their mean, towards 1 for the best of them
-    :param inverse_temperature: beta of the advantage weights: 0 for behavioral cloning, the larger, the more the best actions
+    :param expectile: V(s) is this expectile of the values of the dataset's actions: 0.5 is their mean, near 1 the best of them
+    :param inverse_temperature: beta of the advantage weights: 0 is behavioral cloning; the larger, the more the best actions
         count
-    :param weight_max: bound of the advantage weights
+    :param weight_max: upper bound of the advantage weights
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param reward_fn: rewards in place of the dataset's, see
         :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
@@ -47,7 +49,16 @@ class IQL(RewardBasedAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
-    numbers: ClassVar[dict[str, str]] = {"expectile": SHARE, "inverse_temperature": NOT_NEGATIVE, "weight_max": POSITIVE}
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "expectile": [SHARE],
+        "inverse_temperature": [NOT_NEGATIVE],
+        "weight_max": [POSITIVE],
+    }
+    search_space: ClassVar[SearchSpace] = {
+        **BOOTSTRAPPING,
+        "expectile": Uniform(0.5, 0.95),
+        "inverse_temperature": log_uniform(0.5, 10),
+    }
 
     def __init__(
         self,
@@ -124,7 +135,7 @@ class IQL(RewardBasedAlgorithm):
             critic_loss = bellman_loss(values, targets)
             self._optimize(self.critic.optimizer, critic_loss + value_loss)
 
-            weights = advantage_weights(advantages.detach(), self.inverse_temperature, self.weight_max)
+            weights = exponential_weights(advantages.detach(), self.inverse_temperature, self.weight_max)
             actor_loss = (weights * self.actor.regression_loss(policy_features, batch.actions)).mean()
             self._optimize(self.actor.optimizer, actor_loss)
 

@@ -1,13 +1,13 @@
-"""The losses of IQL as plain functions of values. They know no network, optimizer or dataset."""
+"""The losses of IQL as plain functions of values, without networks, optimizers or datasets."""
 
 import math
 
 import torch as th
 
 
-def advantage_weights(advantages: th.Tensor, inverse_temperature: float, weight_max: float) -> th.Tensor:
+def exponential_weights(advantages: th.Tensor, inverse_temperature: float, weight_max: float) -> th.Tensor:
     """
-    ``min(exp(inverse_temperature * A), weight_max)``.
+    Advantage weights of the dataset's actions: ``min(exp(inverse_temperature * A), weight_max)``.
 
     :param advantages: A = Q(s, a) - V(s), no gradient, ``(batch,)``
     :param inverse_temperature: the larger, the sharper

@@ -1,17 +1,18 @@
 """ORIL: Offline Reinforced Imitation Learning, from examples of success."""
 
 import zlib
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
-from sb3_offline.common.hyperparameters import OR_NONE, POSITIVE, SHARE, WHOLE
+from sb3_offline.common.hyperparameters import POSITIVE, SHARE, WHOLE, Constraints
+from sb3_offline.common.search import Choice, SearchSpace, log_uniform
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
-from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.oril.losses import classifier_loss
 from sb3_offline.oril.reward_model import RewardClassifier
@@ -20,17 +21,17 @@ from sb3_offline.oril.reward_model import RewardClassifier
 class ORIL(ExampleBasedAlgorithm, CQL):
     """
     Offline Reinforced Imitation Learning (ORIL, https://arxiv.org/abs/2011.13885): a classifier learns to tell success
-    examples from the dataset, its probability becomes the reward, and CQL learns from that::
+    examples from the dataset, its probability becomes the reward, and CQL learns from this reward::
 
         r(s) = sigmoid(f(s)),    f:  min  E_{s ~ S*}[CE(f(s); 1)] + E_{s ~ D}[CE(f(s); 0)]
 
-    The classifier is trained and the rewards are computed once, when the dataset is opened; both stay as they are then. The
-    classifier is saved with the model, so a loaded model computes the same rewards without the examples.
+    The classifier is trained and the rewards are computed once, when the dataset is opened. The classifier is saved with the
+    model, so a loaded model computes the same rewards without the examples.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: see :class:`~sb3_offline.cql.cql.CQL`
-    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; rewards in it are not looked at
-    :param examples: Success examples S*: a folder of pictures, an ``.npz`` or HDF5 file, or an array of observations
+    :param dataset: see :class:`~sb3_offline.cql.cql.CQL`; its rewards are not used
+    :param examples: Success examples S*: a folder of images, an ``.npz`` or HDF5 file, or an array of observations
     :param learning_rate: learning rate of actor and critic, a float or a function of the remaining progress (from 1 to 0)
     :param example_batch_size: success examples in a batch of the classifier, beside ``batch_size`` observations of the dataset
     :param reward_steps: gradient steps of the classifier
@@ -42,11 +43,19 @@ class ORIL(ExampleBasedAlgorithm, CQL):
     :param kwargs: the other arguments of :class:`~sb3_offline.cql.cql.CQL`, but no ``reward_fn``
     """
 
-    numbers: ClassVar[dict[str, str]] = {
-        "reward_steps": WHOLE,
-        "reward_learning_rate": POSITIVE,
-        "positive_prior": SHARE + OR_NONE,
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "reward_steps": [WHOLE],
+        "reward_learning_rate": [POSITIVE],
+        "positive_prior": [SHARE, None],
     }
+    search_space: ClassVar[SearchSpace] = {
+        **CQL.search_space,
+        "ent_coef": log_uniform(1e-5, 0.1),
+        "reward_learning_rate": log_uniform(1e-5, 1e-3),
+        "positive_prior": Choice(None, 0.1, 0.3, 0.5),
+    }
+    #: arguments that the trained classifier depends on
+    _classifier_settings: ClassVar[tuple[str, ...]] = ("example_batch_size", *_parameter_constraints)
     reward_model: RewardClassifier
 
     def __init__(
@@ -65,7 +74,7 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         **kwargs: Any,
     ):
         if "reward_fn" in kwargs:
-            raise TypeError("ORIL makes its rewards of the examples; for other rewards take CQL(..., reward_fn=...)")
+            raise TypeError("ORIL makes its rewards from the examples; for other rewards use CQL(..., reward_fn=...)")
         self.reward_steps = reward_steps
         self.reward_learning_rate = reward_learning_rate
         self.positive_prior = positive_prior
@@ -120,21 +129,20 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         self._trained_with = self._training_settings()
 
     def _training_settings(self) -> dict[str, Any]:
-        """:return: all that the classifier is made of, beside the dataset"""
-        loaded = load_examples(self.examples, self.observation_space)  # type: ignore[arg-type]
-        checksum = 0
-        for array in loaded.values() if isinstance(loaded, dict) else [loaded]:
+        """:return: everything that the classifier depends on, apart from the dataset"""
+        examples, checksum = self.read_examples(), 0
+        for array in examples.values() if isinstance(examples, dict) else [examples]:
             checksum = zlib.crc32(array.tobytes(), checksum)
-        return {"examples": checksum, **{name: getattr(self, name) for name in ("example_batch_size", *self.numbers)}}
+        return {"examples": checksum, **{name: getattr(self, name) for name in self._classifier_settings}}
 
     @classmethod
     def load(cls, path: Any, *args: Any, **kwargs: Any) -> "ORIL":  # type: ignore[override]
         """
-        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. Examples, and settings of the classifier, may
-        be given again, but no others than it was trained with.
+        See :meth:`sb3_offline.common.offline_algorithm.OfflineAlgorithm.load`. The examples and the settings of the classifier
+        may be given again if they are those that it was trained with: ``TypeError`` otherwise.
         """
         model = super().load(path, *args, **kwargs)
-        given = {name for name in ("examples", "example_batch_size", *cls.numbers) if kwargs.get(name) is not None}
+        given = {name for name in ("examples", *cls._classifier_settings) if kwargs.get(name) is not None}
         if given and model._trained_with is not None:
             settings = model._training_settings() if "examples" in given else {name: kwargs[name] for name in given}
             others = sorted(name for name in given if settings[name] != model._trained_with[name])
@@ -142,6 +150,11 @@ class ORIL(ExampleBasedAlgorithm, CQL):
                 problem = f"{', '.join(others)} of {path} cannot be replaced: its classifier is trained, and the rewards stay"
                 raise TypeError(f"ORIL: {problem}; make a new model")
         return model
+
+    @th.no_grad()
+    def success_probabilities(self, observations: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor | None:
+        self.reward_model.set_training_mode(False)
+        return self.reward_model(observations).sigmoid()
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

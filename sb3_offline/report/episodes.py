@@ -9,8 +9,6 @@ import numpy as np
 import torch as th
 
 from sb3_offline.benchmark.grid import cell_folder, evaluation_seed
-from sb3_offline.ceborl import CEBORL
-from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.experiment.recording import make_recording_env, record_episode
 from sb3_offline.experiment.training import load_run
@@ -48,11 +46,10 @@ class _Watched:
     @th.no_grad()
     def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
         action, state = self.model.predict(observation, *args, **kwargs)
-        if isinstance(self.model, ActorCriticAlgorithm):
+        if self.model.value_name is not None:
             tensors, _ = self.model.policy.obs_to_tensor(observation)
             scaled = th.as_tensor(self.model.policy.scale_action(action)[None], device=self.model.device)
-            value = self.model.critic.values(self.model.critic.encode(tensors), scaled).amin()
-            self.values.append(float(value.sigmoid() if isinstance(self.model, CEBORL) else value))
+            self.values.append(float(self.model.values(tensors, scaled)))  # type: ignore[arg-type]
         return action, state
 
 
@@ -87,4 +84,4 @@ def play(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any], seed:
         frames, solved_at = record_episode(watched, env, seed)
     finally:
         env.close()
-    return PlayedEpisode(frames, solved_at, watched.values, "C(s, a)" if isinstance(model, CEBORL) else "Q(s, a)")
+    return PlayedEpisode(frames, solved_at, watched.values, model.value_name or "")

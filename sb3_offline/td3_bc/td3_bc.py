@@ -1,5 +1,6 @@
 """TD3+BC: TD3 with a term of behavioral cloning."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch as th
@@ -8,16 +9,17 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE
+from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, Constraints
 from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform, UniformInt, log_uniform
 from sb3_offline.data.reader import DatasetSource
 from sb3_offline.td3_bc.policies import CnnPolicy, DeterministicActor, MlpPolicy, MultiInputPolicy, TD3BCPolicy
 
 
 class TD3BC(RewardBasedAlgorithm):
     """
-    TD3+BC (https://arxiv.org/abs/2106.06860): TD3, whose actor also imitates the dataset::
+    TD3+BC (https://arxiv.org/abs/2106.06860) is TD3 with an actor that also imitates the dataset::
 
         y = r + gamma (1 - terminated) min_i Qbar_i(s', clip(pibar(s') + noise)),    noise ~ clip(N(0, target_policy_noise))
         critic:  min  sum_i E_D[(Q_i(s, a) - y)^2]
@@ -53,11 +55,17 @@ class TD3BC(RewardBasedAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    numbers: ClassVar[dict[str, str]] = {
-        "alpha": NOT_NEGATIVE,
-        "policy_delay": COUNT,
-        "target_policy_noise": NOT_NEGATIVE,
-        "target_noise_clip": NOT_NEGATIVE,
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "alpha": [NOT_NEGATIVE],
+        "policy_delay": [COUNT],
+        "target_policy_noise": [NOT_NEGATIVE],
+        "target_noise_clip": [NOT_NEGATIVE],
+    }
+    search_space: ClassVar[SearchSpace] = {
+        **BOOTSTRAPPING,
+        "alpha": log_uniform(0.5, 10),
+        "policy_delay": UniformInt(1, 3),
+        "target_policy_noise": Uniform(0, 0.5),
     }
     policy: TD3BCPolicy
     actor: DeterministicActor  # type: ignore[assignment]
@@ -163,7 +171,7 @@ class TD3BC(RewardBasedAlgorithm):
     def _update_target(self) -> None:
         super()._update_target()
         if self._n_updates % self.policy_delay == 0:
-            # A shared encoder's target is the critic's, updated already.
+            # The target of a shared encoder is the critic's, which is updated already.
             heads = (m if not self.policy.share_features_extractor else m.mu for m in (self.actor, self.actor_target))
             source, target = (head.parameters() for head in heads)
             polyak_update(source, target, self.tau)

@@ -9,12 +9,12 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_offline
-from sb3_offline.ceborl import CEBORL, DiagnosticsCallback
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.config import config_path, number_or_text, python_value
 from sb3_offline.experiment.data import resolve_data
-from sb3_offline.zoo.hyperparams import SPACES, sample_params
+from sb3_offline.zoo.hyperparams import sample_params
 
 
 class OfflineExperimentManager(ExperimentManager):
@@ -74,7 +74,9 @@ class OfflineExperimentManager(ExperimentManager):
         hyperparams, *rest = super()._preprocess_hyperparams(hyperparams)
         if self.algo in sb3_offline.ALGOS:
             policy_kwargs = hyperparams.setdefault("policy_kwargs", {})
-            HYPERPARAMS_SAMPLER[self.algo] = partial(sample_params, SPACES[self.algo], policy_kwargs=policy_kwargs)
+            HYPERPARAMS_SAMPLER[self.algo] = partial(
+                sample_params, sb3_offline.ALGOS[self.algo].search_space, policy_kwargs=policy_kwargs
+            )
         return hyperparams, *rest
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
@@ -84,6 +86,6 @@ class OfflineExperimentManager(ExperimentManager):
             raise RuntimeError(f"{self.algo}: {error}; check the config and --hyperparams") from error
 
     def learn(self, model: BaseAlgorithm) -> None:
-        if isinstance(model, CEBORL):
-            self.callbacks.append(DiagnosticsCallback())
+        if isinstance(model, OfflineAlgorithm):
+            self.callbacks += model.default_callbacks()
         super().learn(model)

@@ -1,0 +1,243 @@
+"""The recursive classifier of success: terms (b) and (c) of Eq. 10, and the one ``train()`` of all that is built on it."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
+
+from sb3_offline.ceborl.backups import Backup
+from sb3_offline.ceborl.extraction import CriticStep, PolicyExtraction
+from sb3_offline.ceborl.losses import example_loss, mean_of_odds, recursive_loss, success_odds
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE, Constraints, check_parameters
+from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform
+from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples, joined
+from sb3_offline.data.reader import DatasetSource
+
+#: Gradient steps between two looks at the diagnostics that need extra forward passes.
+DIAGNOSTICS_INTERVAL = 50
+
+
+class RecursiveClassifier(ExampleBasedAlgorithm):
+    """
+    The base of CEBORL and RCE: a classifier C(s, a) of success in the discounted future, trained by recursive classification::
+
+        min  (1 - gamma) E_{s ~ S*, a ~ pi}[CE(C(s, a); y = 1)]                                  (b)
+             + E_D[(1 + gamma omega) CE(C(s, a); y = gamma omega / (1 + gamma omega))]           (c)
+
+    A subclass chooses the backup, from which omega is made, and the policy extraction; it may add a penalty, term (a).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param dataset: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
+    :param examples: see :class:`~sb3_offline.common.example_based.ExampleBasedAlgorithm`
+    :param omega_max: upper bound of omega, against overflow
+    :param class_prior: weight of the examples in (b), p(e = 1)
+    :param example_share: weight of the examples among the data of (c)
+    :param initial_odds: odds of the untrained classifier
+    :param ent_coef: entropy coefficient of policy extractions that maximise the classifier
+    :param kwargs: see :class:`~sb3_offline.common.example_based.ExampleBasedAlgorithm`
+    """
+
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
+        "omega_max": [POSITIVE],
+        "class_prior": [POSITIVE],
+        "example_share": [SHARE],
+        "initial_odds": [POSITIVE],
+        "ent_coef": [NOT_NEGATIVE],
+    }
+    search_space: ClassVar[SearchSpace] = {**BOOTSTRAPPING, "example_share": Uniform(0, 0.1)}
+    value_name: ClassVar[str | None] = "C(s, a)"
+    _backup: Backup
+    _extraction: PolicyExtraction
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetSource | None = None,
+        examples: ExampleSource | None = None,
+        *,
+        omega_max: float = 1e4,
+        class_prior: float = 1.0,
+        example_share: float = 0.0,
+        initial_odds: float = 1.0,
+        ent_coef: float = 1e-4,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, dataset, examples, **kwargs)
+        self.omega_max = omega_max
+        self.class_prior = class_prior
+        self.example_share = example_share
+        self.initial_odds = initial_odds
+        self.ent_coef = ent_coef
+        self._extraction_state: Any = None  # between a saved model and the extraction of the loaded one
+
+    def _make_parts(self) -> tuple[Backup, PolicyExtraction]:
+        """:return: a new backup and a new policy extraction, as the constructor's arguments say"""
+        raise NotImplementedError
+
+    def _setup_model(self) -> None:
+        check_parameters(self)  # before the parts are chosen by them
+        self._backup, self._extraction = self._make_parts()
+        self.needs_next_actions = self._backup.needs_next_actions
+        if "_weighted_transitions" in self.__dict__:  # of a zip that an earlier version saved
+            self._extraction_state = self.__dict__.pop("_weighted_transitions"), self.__dict__.pop("_dataset_checksum")
+        if self._extraction_state is not None:
+            self._extraction.set_state(self._extraction_state)
+            self._extraction_state = None
+        super()._setup_model()
+
+    def all_policy_kwargs(self) -> dict[str, Any]:
+        own: dict[str, Any] = {"critic_output_bias": math.log(self.initial_odds)}
+        if self._extraction.needs_state_head or self._backup.fits_state_head:
+            own["critic_state_value"] = True
+        if self._extraction.std_min is not None:
+            own["std_min"] = self._extraction.std_min
+        return {**own, **self.policy_kwargs}
+
+    def _open_data(self) -> None:
+        super()._open_data()
+        self.read_examples()
+
+    def _on_data_opened(self, buffer: OfflineReplayBuffer) -> None:
+        super()._on_data_opened(buffer)
+        self._extraction.start(buffer.checksum())
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            observations = self.augment(batch.observations)
+            examples, example_rows = self.sample_examples()
+            examples = self.augment(examples)
+            # One pass of the encoder for both: for a small batch, reading the weights takes longer than encoding its images
+            features, distinct_features = self.critic.encode(joined([observations, examples])).tensor_split([batch_size])
+            example_features = distinct_features[example_rows]
+            with th.no_grad():
+                example_actions, _ = self.actor.sample(self._policy_features(examples, example_features, example_rows))
+                discounted_omega = self._discounted_omega(batch)
+                example_omega = self._example_omega(examples, example_rows, example_actions)
+
+            # Eq. 10. The rows of `logits` are the critics; a head of states may be one more classifier, the last row.
+            both_features = th.cat([features, example_features])
+            logits = self.critic.values(both_features, th.cat([batch.actions, example_actions]))
+            data_logits, example_logits = logits[:, :batch_size], logits[:, batch_size:]
+            if self._extraction.needs_state_head and not self._backup.fits_state_head:
+                logits = th.cat([logits, self.critic.state_values(both_features).unsqueeze(0)])
+                state_logits = logits[-1, :batch_size]
+            term_c = recursive_loss(logits[:, :batch_size], discounted_omega)
+            term_b = self._example_term(logits[:, batch_size:], example_omega)
+            term_a = self._conservative_term(observations, features, data_logits)
+            critic_loss = term_c + term_b + term_a
+            if self._backup.fits_state_head:
+                state_logits, state_loss = self._backup.state_loss(observations, features, batch.actions)
+                critic_loss = critic_loss + state_loss
+            self._optimize(self.critic.optimizer, critic_loss)
+
+            assert batch.indices is not None
+            step = CriticStep(
+                observations,
+                features,
+                batch.indices,
+                discounted_omega,
+                data_logits.detach(),
+                example_logits.detach(),
+                state_logits.detach() if self._extraction.needs_state_head else None,
+            )
+            actor_loss = self._extraction.actor_loss(step)
+            self._optimize(self.actor.optimizer, actor_loss)
+
+            self._n_updates += 1
+            self._update_target()
+            self._record(
+                critic_loss=critic_loss,
+                actor_loss=actor_loss,
+                classifier_data=data_logits.sigmoid().mean(),
+                classifier_examples=example_logits.sigmoid().mean(),
+            )
+            if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
+                self._record_diagnostics(observations, features, discounted_omega / self.gamma)
+
+    def _conservative_term(self, observations: PyTorchObs, features: th.Tensor, data_logits: th.Tensor) -> th.Tensor:
+        """
+        Term (a) with its weight; none here.
+
+        :param observations: a batch
+        :param features: the critic's features of it, ``(batch, features_dim)``
+        :param data_logits: logits of the dataset's actions, ``(n_critics, batch)``
+        :return: scalar
+        """
+        return data_logits.new_zeros(())
+
+    def _example_term(self, logits: th.Tensor, example_omega: th.Tensor | None) -> th.Tensor:
+        """Term (b), and the examples' part of term (c), which bounds the odds by ``1 / example_share``."""
+        loss = example_loss(logits, self.gamma, self.class_prior)
+        if example_omega is not None:
+            loss = loss + self.example_share * recursive_loss(logits, example_omega)
+        return loss
+
+    def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
+        """
+        :param batch: transitions
+        :return: ``gamma * omega`` of Eq. 3, the positive weight of each transition in term (c), ``(batch,)``
+        """
+        discounts = [horizon.discounts.squeeze(1) for horizon in batch.horizons]
+        return mean_of_odds(self._target_logits(batch), discounts, self.omega_max)
+
+    def _example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor | None:
+        """:return: ``gamma * omega`` of the examples as their own successors, if they count among the data of term (c)"""
+        if self.example_share == 0:
+            return None
+        target_logits = self.critic_target.values(self.critic_target.encode(examples)[rows], actions)
+        return self.gamma * success_odds(target_logits, self.omega_max)
+
+    def _target_logits(self, batch: OfflineSamples) -> tuple[th.Tensor, ...]:
+        """
+        :param batch: transitions
+        :return: the target's logits after each horizon, ``(n_critics, batch)`` each
+        """
+        successors = joined([self.augment(horizon.observations) for horizon in batch.horizons])
+        logits = self._backup.target_logits(successors, self.critic_target.encode(successors), batch.horizons)
+        self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
+        return logits.chunk(len(batch.horizons), dim=1)
+
+    @th.no_grad()
+    def _record_diagnostics(self, observations: PyTorchObs, features: th.Tensor, omega: th.Tensor) -> None:
+        actions, log_prob = self.actor.sample(self._policy_features(observations, features))
+        p50, p99 = th.quantile(omega, th.tensor([0.5, 0.99], device=omega.device))
+        self._record(
+            log_prob=log_prob.mean(),
+            classifier_policy=self.critic.values(features, actions).amin(dim=0).sigmoid().mean(),
+            omega_p50=p50,
+            omega_p99=p99,
+        )
+
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        self._extraction_state = self._extraction.get_state()
+        super().save(path, exclude, include)
+        self._extraction_state = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_backup", "_extraction"]
+
+    @th.no_grad()
+    def values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor | None:
+        return self.critic.values(self.critic.encode(observations), actions).amin(dim=0).sigmoid()
+
+    def success_probabilities(self, observations: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor | None:
+        if actions is None:
+            actions = self.policy._predict(observations, deterministic=True)  # type: ignore[arg-type]
+        return self.values(observations, actions)
+
+    @th.no_grad()
+    def td_errors(self, batch: OfflineSamples) -> th.Tensor | None:
+        """See :meth:`OfflineAlgorithm.td_errors`; these are errors of the probabilities in the recursion."""
+        logits = self.critic.values(self.critic.encode(batch.observations), batch.actions)
+        omega = self.gamma * success_odds(self._next_values(batch), self.omega_max)
+        return (logits.sigmoid() - omega / (1 + omega)).abs().mean(dim=0)
