@@ -36,8 +36,11 @@ html_theme = "alabaster"
 html_title = f"sb3-offline {version}"
 html_theme_options = {
     "description": "Offline and example-based RL for Stable-Baselines3",
-    "page_width": "1100px",
+    "page_width": "1240px",
+    "body_max_width": "950px",
     "sidebar_width": "240px",
+    "font_size": "16px",
+    "code_font_size": "0.85em",
     "fixed_sidebar": True,
 }
 html_show_copyright = False
