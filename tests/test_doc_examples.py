@@ -39,7 +39,7 @@ FILES = {
     "data/drawer_examples.h5": "drawer_frames.h5",
     "data/*.h5": "pixels.h5",
     "episodes.h5": "pixels.h5",
-    "pictures_of_success/": "pictures",
+    "images_of_success/": "images",
     "rollouts.npz": "rollouts.npz",
 }
 
@@ -116,10 +116,10 @@ def stand_ins(tmp_path_factory):
         ("drawer_frames.h5", "pixels.h5", "drawer-open"),
     ):
         main(["examples", str(folder / dataset), "--source", task, "-n", "10", "-o", str(folder / name)])
-    (folder / "pictures").mkdir()
+    (folder / "images").mkdir()
     space = OfflineDataset(folder / "pixels.h5").observation_space
     for number, frame in enumerate(load_examples(folder / "drawer_frames.h5", space)):
-        Image.fromarray(frame).save(folder / f"pictures/{number}.png")
+        Image.fromarray(frame).save(folder / f"images/{number}.png")
     # Two episodes of Pendulum-v1 as imitation writes them
     rollouts = {"obs": np.zeros((402, 3)), "acts": np.zeros((400, 1)), "rews": np.zeros(400), "terminal": np.ones(2, bool)}
     np.savez(folder / "rollouts.npz", indices=[200], **rollouts)
