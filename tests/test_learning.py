@@ -42,7 +42,19 @@ def closeness(batch):
         (IQL, {"reward_fn": closeness}),
         (TD3BC, {"reward_fn": closeness, "learning_rate": 1e-3}),
         (DCQL, {"examples": goal_examples(), "n_action_samples": 4}),
-        (ORIL, {"examples": goal_examples(), "n_action_samples": 4, "reward_steps": 200}),
+        # The prior and the larger penalty make it reach the goal with every seed; with its defaults one seed in three does
+        (
+            ORIL,
+            {
+                "examples": goal_examples(),
+                "reward_steps": 200,
+                "positive_prior": 0.25,
+                "learning_rate": 1e-3,
+                "cql_alpha": 1.0,
+                "ent_coef": 1e-3,
+                "n_action_samples": 4,
+            },
+        ),
     ],
 )
 def test_reward_based_algorithms_reach_the_goal_of_their_rewards(algorithm, settings, dataset):
