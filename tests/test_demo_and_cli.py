@@ -44,8 +44,8 @@ def test_demo_leaves_all_it_promises(demo):
     with Image.open(folder / "policy.gif") as gif:
         assert gif.n_frames > 30 and gif.size == (200, 200)
     for name in ("learning_curve.png", "classifier.png"):
-        with Image.open(folder / name) as picture:
-            assert picture.width > 500
+        with Image.open(folder / name) as image:
+            assert image.width > 500
     assert sum(1 for _ in (folder / "runs/ceborl/evaluations.csv").open()) == 3
 
 
@@ -169,7 +169,7 @@ def test_paper_preset_and_paper_config_are_the_same():
 
 
 class Blinks(gym.Env):
-    """Says success at one step in the middle only, in every second episode."""
+    """Reports success at only one step, in the middle of every second episode."""
 
     observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Box(-1, 1, (1,))
     n_episodes = 0
@@ -189,7 +189,7 @@ def test_success_counts_at_any_step():
     gym.register("Blinks-v0", Blinks)
     policy = ALGOS["bc"]("MlpPolicy", Blinks())
     assert evaluate_success(policy, "Blinks-v0", {}, n_episodes=4).successes == [True, False, True, False]
-    with pytest.raises(ValueError, match="0 episodes say nothing"):
+    with pytest.raises(ValueError, match="n_episodes is 0; play at least one"):
         evaluate_success(policy, "Blinks-v0", {}, n_episodes=0)
 
 
@@ -213,7 +213,7 @@ class Still:
 
 
 class Grey(gym.Env):
-    """Draws pictures of its own size, and knows no other."""
+    """Renders images of a fixed size."""
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
     observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
@@ -232,13 +232,13 @@ class Grey(gym.Env):
         return np.full((20, 30, 3), 128, np.uint8)
 
 
-def test_any_environment_that_draws_pictures_is_recorded(tmp_path):
+def test_any_environment_that_renders_images_is_recorded(tmp_path):
     gym.register("Grey-v0", Grey)
     assert record_gif(Still(1), "Grey-v0", {}, tmp_path / "grey.gif", n_episodes=2) == [False, False]
-    with Image.open(tmp_path / "grey.gif") as picture:
-        assert picture.size == (30, 20)
+    with Image.open(tmp_path / "grey.gif") as image:
+        assert image.size == (30, 20)
     gym.register("Blind-v0", lambda: Grey())
-    with pytest.raises(RuntimeError, match="Blind-v0 draws no pictures"):
+    with pytest.raises(RuntimeError, match="Blind-v0 renders no images"):
         record_gif(Still(1), "Blind-v0", {}, tmp_path / "blind.gif")
 
 
