@@ -1,6 +1,9 @@
 """The command line on real, small data: what the README promises, in seconds instead of minutes."""
 
 import csv
+import subprocess
+import sys
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium as gym
@@ -9,6 +12,7 @@ import pytest
 from PIL import Image
 
 from sb3_offline import ALGOS, cli
+from sb3_offline.commands import COMMANDS
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.demo.pipeline import METHODS, DemoSettings, run_demo
@@ -249,3 +253,28 @@ def test_recorded_episodes_are_those_of_the_evaluation(tmp_path):
     record_gif(recorded, "MultimodalMetaworld-v0", env_kwargs, tmp_path / "still.gif", n_episodes=2, size=16)
     np.testing.assert_array_equal(evaluated.starts, recorded.starts)
     assert not np.array_equal(*evaluated.starts)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([name, "--help"])
+    text = capsys.readouterr().out
+    assert f"usage: sb3-offline {name}" in text
+    assert name != "train" or all(algo in text for algo in ALGOS)
+
+
+def test_the_list_of_commands_imports_no_learner():
+    code = """
+import sys, types
+package = types.ModuleType("sb3_offline")  # without its __init__, which imports the algorithms
+package.__path__ = [sys.argv[1]]
+sys.modules["sb3_offline"] = package
+from sb3_offline.cli import main
+try:
+    main(["--help"])
+finally:
+    assert not {"torch", "gymnasium", "sb3_offline.ceborl"} & set(sys.modules)
+"""
+    command = [sys.executable, "-c", code, str(Path(cli.__file__).parent)]
+    assert "collect-sac" in subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -19,6 +19,6 @@ COMMANDS = {
     "evaluate": "measure how often a trained policy succeeds",
     "benchmark": "train and evaluate a grid of methods, tasks and seeds",
     "report": "make tables and figures from the results of a benchmark",
-    "demo": "collect, train, evaluate and report, without any options",
+    "demo": "do everything in one go: collect, train, evaluate and report",
 }
 """The help text of each command, by name."""
