@@ -11,8 +11,8 @@ from pathlib import Path
 
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_scripted import TASKS, collect_scripted
-from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.data_tools.collecting.scripted import TASKS, collect_scripted
+from sb3_offline.data_tools.converting.extract_examples import extract_examples
 
 N_EXAMPLES, HELD_OUT_SEED, HELD_OUT_EPISODES = 200, 1000, 120
 

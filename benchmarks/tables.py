@@ -17,7 +17,7 @@ from typing import Any
 from scipy.stats import ttest_ind
 
 from sb3_offline.demo.pipeline import result_table
-from sb3_offline.report.results import Cell, comparison_table, read_results
+from sb3_offline.report.results import Entry, comparison_table, read_results
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK = re.compile(r"(<!-- (results/\S+\.(?:csv|json)) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -116,14 +116,14 @@ def rate_table(rows: list[dict[str, str]]) -> str:
     for label in dict.fromkeys(row[name] for row in rows):
         cells, means = [], []
         for task in tasks:
-            cell = Cell([row for row in rows if row[name] == label and row["task"] == task])
-            if not cell.rows:
+            entry = Entry([row for row in rows if row[name] == label and row["task"] == task])
+            if not entry.rows:
                 cells.append("")
                 continue
-            rates = [part.rate for part in cell.by("seed").values()]
+            rates = [part.rate for part in entry.by("seed").values()]
             spread = f" ({min(rates):.2f} to {max(rates):.2f})" if len(rates) > 1 else ""
-            means.append(cell.rate)
-            cells.append(f"{cell.rate:.2f}{spread}" + ", crashed" * cell.failed)
+            means.append(entry.rate)
+            cells.append(f"{entry.rate:.2f}{spread}" + ", crashed" * entry.failed)
         mean = f"{sum(means) / len(means):.2f}" if len(means) == len(tasks) else ""
         lines.append(f"| {label} | " + " | ".join([*cells, mean]) + " |")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""A small grid, its data, and what comes of it, for the tests of the benchmark."""
+"""A small grid, its data and its rows, for the tests of the benchmark."""
 
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,8 @@ import yaml
 from sb3_offline.benchmark.table import table_rows
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_scripted import collect_scripted
-from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.data_tools.collecting.scripted import collect_scripted
+from sb3_offline.data_tools.converting.extract_examples import extract_examples
 
 GRID: dict[str, Any] = {
     "env": "MultimodalMetaworld-v0",
@@ -44,12 +44,12 @@ def write_grid(folder: Path, data: dict[str, str], **changes: Any) -> str:
 
 
 def rows_of(cells: dict) -> list[dict[str, Any]]:
-    """:return: rows of the table, but not of which commit they are: somebody may commit meanwhile"""
+    """:return: rows of the table without their commit, since somebody may commit meanwhile"""
     return [{name: value for name, value in row.items() if name != "commit"} for row in table_rows(cells)]
 
 
 def assert_same(one: Any, other: Any) -> None:
-    """Of nested dicts and lists of tensors: policies and optimizers."""
+    """Compare nested dicts and lists of tensors, such as policies and optimizers."""
     if isinstance(one, th.Tensor):
         assert th.equal(one, other)
     elif isinstance(one, dict):

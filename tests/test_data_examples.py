@@ -12,7 +12,7 @@ from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import load_examples, save_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.data_tools.converting.extract_examples import extract_examples
 
 CHANNEL_FIRST = spaces.Box(0, 255, (3, 8, 6), np.uint8)
 FRAMES = make_observations(IMAGES, 5, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""The page of ``sb3-offline inspect``, and what it shows of several files, of examples, and of the table."""
+"""The page of ``sb3-offline inspect``: for several files, with success examples, and of the table."""
 
 import json
 from html.parser import HTMLParser
@@ -14,20 +14,20 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
-from sb3_offline.data_tools.dataset_statistics import (
+from sb3_offline.data_tools.inspecting.dataset_statistics import (
     action_histograms,
     episode_returns,
     inspect_dataset,
     solved_by,
     table_coverage,
 )
-from sb3_offline.data_tools.joined_datasets import JoinedDatasets
+from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
 
 VOID = {"meta", "img", "br", "rect", "line", "circle", "image", "polyline"}
 
 
 class Page(HTMLParser):
-    """Holds a page's tables, texts and references, and sees that its tags are closed."""
+    """Holds the tables, texts and references of a page, and checks that its tags are closed."""
 
     def __init__(self, path):
         super().__init__()
@@ -62,7 +62,7 @@ class Page(HTMLParser):
             self.tables[-1][-1][-1] += data
 
     def table(self, head):
-        """The table whose head begins so: first cell of each row to the others."""
+        """:return: the rows of the table whose head begins like this: the other cells by the first one"""
         (found,) = (table for table in self.tables if table[0][: len(head)] == head)
         return {first: rest for first, *rest in found[1:]}
 
@@ -131,7 +131,7 @@ def test_shards_are_inspected_together(tmp_path, capsys):
     together = {name: np.concatenate([OfflineDataset(p.path).arrays[name] for p in data.parts]) for name in data.arrays}
     for name, array in data.arrays.items():
         rows = np.array([len(array) - 1, 0, len(array) // 2])
-        if name != "episodes/source":  # the files number their labels in other orders
+        if name != "episodes/source":  # the files hold their labels in different orders
             np.testing.assert_array_equal(array[:], together[name])
             np.testing.assert_array_equal(array[rows], together[name][rows])
             np.testing.assert_array_equal(array[3:-2], together[name][3:-2])
@@ -157,7 +157,7 @@ def test_labels_that_one_file_lacks_are_named(tmp_path, capsys):
 
 
 def test_examples_are_held_against_the_data(tmp_path, capsys):
-    """Frames with a bright spot that moves: those of other episodes are alike, those of another camera are not."""
+    """In frames with a moving bright spot, those of other episodes are similar, and those of another camera are not."""
     rng = np.random.default_rng(0)
 
     def episode(steps=20):
@@ -175,7 +175,7 @@ def test_examples_are_held_against_the_data(tmp_path, capsys):
     save_examples(tmp_path / "own.h5", inside, space, {"held_out": True})
     page = inspect(tmp_path, tmp_path / "a.h5", "--examples", tmp_path / "own.h5")
     text = "".join(page.texts)
-    assert "4 are among the 126 observations" in text and "0 are like none of them" in text
+    assert "compared with 126 observations: 4 are among them, 0 are unlike all of them" in text
     assert "4 of 4 are observations of this data, but are recorded as held out from it" in capsys.readouterr().out
     assert_stands_alone(page)
     np.save(tmp_path / "alike.npy", episode()[17:21])
@@ -183,7 +183,7 @@ def test_examples_are_held_against_the_data(tmp_path, capsys):
     assert summary["examples"]["identical"] == 0 == len(summary["examples"]["far"]) and summary["warnings"] == []
     np.save(tmp_path / "turned.npy", episode()[17:21, ::-1])
     inspect(tmp_path, tmp_path / "a.h5", "--examples", tmp_path / "turned.npy")
-    assert "examples: 4 of 4 are like no observation of the data" in capsys.readouterr().out
+    assert "examples: 4 of 4 are unlike every observation of the data" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="examples"):
         inspect_dataset(tmp_path / "a.h5", np.zeros((2, 5)))
 
@@ -222,7 +222,7 @@ def test_states_of_the_table_are_drawn_and_mapped(tmp_path):
     pytest.importorskip("metaworld")
     import gymnasium as gym
 
-    from sb3_offline.data_tools.collect_scripted import collect_scripted
+    from sb3_offline.data_tools.collecting.scripted import collect_scripted
     from sb3_offline.envs.multimodal_metaworld import TASKS, scene
 
     path = tmp_path / "states.h5"

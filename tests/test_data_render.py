@@ -10,8 +10,8 @@ from data_files import write_dataset
 from sb3_offline import cli
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools import render_dataset
-from sb3_offline.data_tools.collect_scripted import collect_scripted
+from sb3_offline.data_tools.collecting.scripted import collect_scripted
+from sb3_offline.data_tools.converting import render_dataset
 
 CAMERA = {"azimuth": 120.0, "lookat": [0.1, 0.7, 0.1]}
 

@@ -11,8 +11,8 @@ from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
-from sb3_offline.data_tools import inspect_dataset
-from sb3_offline.data_tools.inspect_dataset import format_summary
+from sb3_offline.data_tools.inspecting.dataset_statistics import inspect_dataset
+from sb3_offline.data_tools.inspecting.summary import format_summary
 
 
 @pytest.mark.parametrize("space", [IMAGES, BOTH])
@@ -103,15 +103,15 @@ def test_warnings_of_an_unsound_file(tmp_path):
 
     with h5py.File(path, "r+") as file:
         file["extras/noise"][3] = noise[3]
-    summary = inspect_dataset.inspect_dataset(path)
+    summary = inspect_dataset(path)
     text = "\n".join(f"{warning['field']}: {warning['problem']}" for warning in summary["warnings"])
     for message in (
-        "actions: 100.0% of the steps are outside",
+        "actions: 100.0% of the steps are outside the action space",
         "success: no step is labelled",
         "terminated, truncated: 2 episodes end without either",
         "extras/noise: 1 rows hold NaN",
         "observations/state: never changes in 1 of 3 columns (1)",
-        "observations/state: outside of the observation space in 1 columns (0)",
+        "observations/state: outside the observation space in 1 columns (0)",
         "observations/image: 100.0% of 18 sampled images are of one colour",
         "rewards: never changes",
         "episodes: 1 repeat an earlier one (1)",
@@ -119,4 +119,4 @@ def test_warnings_of_an_unsound_file(tmp_path):
         assert message in text
         assert message in format_summary(summary)
     write_dataset(tmp_path / "empty.h5", 0)
-    assert "there is no episode" in format_summary(inspect_dataset.inspect_dataset(tmp_path / "empty.h5"))
+    assert "there is no episode" in format_summary(inspect_dataset(tmp_path / "empty.h5"))

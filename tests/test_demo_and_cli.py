@@ -2,6 +2,9 @@
 
 import csv
 import inspect
+import subprocess
+import sys
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium as gym
@@ -10,6 +13,7 @@ import pytest
 from PIL import Image
 
 from sb3_offline import ALGOS, cli
+from sb3_offline.commands import COMMANDS
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.demo.pipeline import METHODS, DemoSettings, run_demo
@@ -45,8 +49,8 @@ def test_demo_leaves_all_it_promises(demo):
     with Image.open(folder / "policy.gif") as gif:
         assert gif.n_frames > 30 and gif.size == (200, 200)
     for name in ("learning_curve.png", "classifier.png"):
-        with Image.open(folder / name) as picture:
-            assert picture.width > 500
+        with Image.open(folder / name) as image:
+            assert image.width > 500
     assert sum(1 for _ in (folder / "runs/ceborl/evaluations.csv").open()) == 3
 
 
@@ -171,7 +175,7 @@ def test_paper_preset_and_paper_config_are_the_same():
 
 
 class Blinks(gym.Env):
-    """Says success at one step in the middle only, in every second episode."""
+    """Reports success at only one step, in the middle of every second episode."""
 
     observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Box(-1, 1, (1,))
     n_episodes = 0
@@ -191,7 +195,7 @@ def test_success_counts_at_any_step():
     gym.register("Blinks-v0", Blinks)
     policy = ALGOS["bc"]("MlpPolicy", Blinks())
     assert evaluate_success(policy, "Blinks-v0", {}, n_episodes=4).successes == [True, False, True, False]
-    with pytest.raises(ValueError, match="0 episodes say nothing"):
+    with pytest.raises(ValueError, match="n_episodes is 0; play at least one"):
         evaluate_success(policy, "Blinks-v0", {}, n_episodes=0)
 
 
@@ -215,7 +219,7 @@ class Still:
 
 
 class Grey(gym.Env):
-    """Draws pictures of its own size, and knows no other."""
+    """Renders images of a fixed size."""
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
     observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
@@ -234,13 +238,13 @@ class Grey(gym.Env):
         return np.full((20, 30, 3), 128, np.uint8)
 
 
-def test_any_environment_that_draws_pictures_is_recorded(tmp_path):
+def test_any_environment_that_renders_images_is_recorded(tmp_path):
     gym.register("Grey-v0", Grey)
     assert record_gif(Still(1), "Grey-v0", {}, tmp_path / "grey.gif", n_episodes=2) == [False, False]
-    with Image.open(tmp_path / "grey.gif") as picture:
-        assert picture.size == (30, 20)
+    with Image.open(tmp_path / "grey.gif") as image:
+        assert image.size == (30, 20)
     gym.register("Blind-v0", lambda: Grey())
-    with pytest.raises(RuntimeError, match="Blind-v0 draws no pictures"):
+    with pytest.raises(RuntimeError, match="Blind-v0 renders no images"):
         record_gif(Still(1), "Blind-v0", {}, tmp_path / "blind.gif")
 
 
@@ -251,3 +255,28 @@ def test_recorded_episodes_are_those_of_the_evaluation(tmp_path):
     record_gif(recorded, "MultimodalMetaworld-v0", env_kwargs, tmp_path / "still.gif", n_episodes=2, size=16)
     np.testing.assert_array_equal(evaluated.starts, recorded.starts)
     assert not np.array_equal(*evaluated.starts)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([name, "--help"])
+    text = capsys.readouterr().out
+    assert f"usage: sb3-offline {name}" in text
+    assert name != "train" or all(algo in text for algo in ALGOS)
+
+
+def test_the_list_of_commands_imports_no_learner():
+    code = """
+import sys, types
+package = types.ModuleType("sb3_offline")  # without its __init__, which imports the algorithms
+package.__path__ = [sys.argv[1]]
+sys.modules["sb3_offline"] = package
+from sb3_offline.cli import main
+try:
+    main(["--help"])
+finally:
+    assert not {"torch", "gymnasium", "sb3_offline.ceborl"} & set(sys.modules)
+"""
+    command = [sys.executable, "-c", code, str(Path(cli.__file__).parent)]
+    assert "collect-sac" in subprocess.run(command, check=True, capture_output=True, text=True).stdout

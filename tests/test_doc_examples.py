@@ -24,7 +24,7 @@ from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.convert import convert
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_sac import SAMPLES
+from sb3_offline.data_tools import SAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)

@@ -7,7 +7,7 @@ import sb3_offline.envs  # noqa: F401
 pytest.importorskip("metaworld")
 
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_scripted import collect_scripted, scripted_episodes
+from sb3_offline.data_tools.collecting.scripted import collect_scripted, scripted_episodes
 from sb3_offline.envs.multimodal_metaworld import TASKS
 
 

@@ -14,7 +14,7 @@ pytest.importorskip("metaworld")
 
 from metaworld.asset_path_utils import full_V3_path_for
 
-from sb3_offline.data_tools.collect_scripted import SCRIPTS
+from sb3_offline.data_tools.collecting.scripted import SCRIPTS
 from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, TASKS, MultimodalMetaworldEnv, rendering
 from sb3_offline.envs.multimodal_metaworld.scene import TableScene
 

@@ -1,4 +1,4 @@
-"""A grid of runs: whatever is killed, its table is that of a grid that was not."""
+"""A grid of runs. Its table is the same whether or not processes are killed."""
 
 import csv
 import json
@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,11 +23,12 @@ from sb3_offline.benchmark import local
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.table import table_writer
-from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, record_failure, train_run
+from sb3_offline.benchmark.worker import LOCK_FILE, _Provenance, complete_run, record_failure
 from sb3_offline.common.provenance import current_commit
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.policy_file import load_policy
-from sb3_offline.experiment.training import RESUME_FILE, load_run, run_record, train
+from sb3_offline.experiment.run import TrainingRun
+from sb3_offline.experiment.training import RESUME_FILE, load_run, train_run
 from sb3_offline.report.results import read_results, with_early_checkpoints
 
 TABLE = "evaluations-door-open.csv"
@@ -59,7 +61,7 @@ def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
     chosen = grid.cells(["ceborl", "cql"], ["door-open"])
     whole, killed = (plan(grid, tmp_path / name, chosen) for name in ("whole", "killed"))
     for run in whole.values():
-        train_run(run)
+        complete_run(run)
     ceborl, cql = killed.values()
     done = threading.Event()
     with ThreadPoolExecutor() as pool:
@@ -95,16 +97,16 @@ def test_a_run_goes_on_from_its_last_save(data, tmp_path):
     grid = load_grid(write_grid(tmp_path, data))
     (run,) = plan(grid, tmp_path / "runs", grid.cells(["ceborl"], ["door-open"])).values()
     stops, goes_on = _Interruption(28), _Interruption(None)
-    arguments = {**run.arguments, "save_freq": run.grid.save_freq, "progress_bar": False}
     with pytest.raises(KeyboardInterrupt):
-        train(**arguments, callbacks=[stops])
-    train(**arguments, callbacks=[goes_on])
+        train_run(run.training, progress_bar=False, callbacks=[stops])
+    train_run(run.training, progress_bar=False, callbacks=[goes_on])
     assert (stops.began, goes_on.began) == (0, 25)
 
 
 def test_a_run_knows_its_chosen_episodes_again(data):
     def record(episodes):
-        return run_record("bc", "x", {}, dataset=OfflineDataset(data["dataset"]).select(episodes), examples=np.arange(2000))
+        dataset = OfflineDataset(data["dataset"]).select(episodes)
+        return TrainingRun("bc", "x", {}, Path("run"), dataset=dataset, examples=np.arange(2000)).record()
 
     assert record([0, 1]) == record([0, 1]) != record([0, 2])
 
@@ -212,13 +214,13 @@ def _die(run):
 
 
 def test_a_method_may_have_data_of_its_own(data, tmp_path):
-    own = {"dataset": "pictures.h5", "examples": "pictures_{task}.h5"}
+    own = {"dataset": "images.h5", "examples": "images_{task}.h5"}
     methods = {name: {"algo": "ceborl", "config": "ceborl", "changes": changes} for name, changes in (("a", {}), ("b", own))}
     cells = plan(load_grid(write_grid(tmp_path, data, methods=methods)), tmp_path / "runs")
     for name, expected in (("a", data), ("b", own)):
-        arguments = cells[name, "door-open", 3].arguments
-        assert arguments["dataset"] == expected["dataset"]
-        assert arguments["examples"] == expected["examples"].replace("{task}", "door-open")
+        training = cells[name, "door-open", 3].training
+        assert training.dataset == expected["dataset"]
+        assert training.examples == expected["examples"].replace("{task}", "door-open")
 
 
 def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
@@ -231,11 +233,11 @@ def test_the_report_plays_the_final_policies(data, tmp_path, monkeypatch):
     cli.main(["report", str(tmp_path / "table.csv"), "-o", str(tmp_path / "report"), "--runs", str(tmp_path / "runs")])
     text = (tmp_path / "report/report.md").read_text()
     for name in ("table_door-open.jpg", "table_values.png"):
-        with Image.open(tmp_path / "report" / name) as picture:
-            assert picture.width > 200 and name in text
+        with Image.open(tmp_path / "report" / name) as image:
+            assert image.width > 200 and name in text
     results = read_results(tmp_path / "table.csv")
-    assert [*results.cells["bc", "door-open"].by("step")] == [3, 4]
-    assert [*with_early_checkpoints(results, tmp_path / "table.csv").cells["bc", "door-open"].by("step")] == [1, 2, 3, 4]
+    assert [*results.entries["bc", "door-open"].by("step")] == [3, 4]
+    assert [*with_early_checkpoints(results, tmp_path / "table.csv").entries["bc", "door-open"].by("step")] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(

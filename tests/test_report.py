@@ -1,4 +1,4 @@
-"""What a report says is what the CSV file says."""
+"""A report agrees with its CSV file."""
 
 import csv
 
@@ -72,16 +72,16 @@ def test_one_command_makes_the_report(table, tmp_path, monkeypatch):
     for part in ("ten trials", "ceborl 0.84 (paper 0.63); mine 0.32; rce", "- rce, door-open, seed 1: it", "80, 100"):
         assert part in text
     for name in ("table1_x.png", "table1_x_curves.png"):
-        with Image.open(tmp_path / "report" / name) as picture:
-            assert picture.width > 500
+        with Image.open(tmp_path / "report" / name) as image:
+            assert image.width > 500
 
 
 def test_tables_of_one_name_are_refused(table, tmp_path):
-    """Their figures would be."""
+    """Their figures would have one name."""
     other = tmp_path / "other" / table.name
     other.parent.mkdir()
     other.write_bytes(table.read_bytes())
-    with pytest.raises(SystemExit, match="rename those of one name"):
+    with pytest.raises(SystemExit, match="rename those of the same name"):
         cli.main(["report", str(table), str(other), "-o", str(tmp_path / "report")])
 
 

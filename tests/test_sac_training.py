@@ -1,4 +1,4 @@
-"""train-sac and export-sac at a scale of seconds."""
+"""train-sac and select-sac at a scale of seconds."""
 
 import csv
 import json
@@ -13,8 +13,8 @@ from stable_baselines3 import SAC
 
 from sb3_offline import cli
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data_tools import train_sac
-from sb3_offline.data_tools.sac_policies import SacActor, actor_weights, load_policies
+from sb3_offline.data_tools.sac import training
+from sb3_offline.data_tools.sac.policies import SacActor, actor_weights, load_policies
 
 SMALL = {
     "learning_starts": 60,
@@ -33,7 +33,7 @@ def _train(folder, n_timesteps, *options):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setitem(train_sac.SETTINGS, "n_step", {**SMALL, "policy_kwargs": {"net_arch": [8, 6]}})
+    monkeypatch.setitem(training.SETTINGS, "n_step", {**SMALL, "policy_kwargs": {"net_arch": [8, 6]}})
 
 
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, capsys):
@@ -57,7 +57,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, c
 
     (tmp_path / "policies").mkdir()
     (tmp_path / "policies/mine.npz").write_bytes(b"of somebody else")
-    command = ["export-sac", str(tmp_path / "stopped"), "-o", str(tmp_path / "policies"), "--checkpoints", "2"]
+    command = ["select-sac", str(tmp_path / "stopped"), "-o", str(tmp_path / "policies"), "--checkpoints", "2"]
     cli.main([*command, "--episodes", "2", "--workers", "1"])
     policies = load_policies(tmp_path / "policies")
     assert [(c.step, c.episodes) for c in policies["drawer-open"]] == [(100, 2), (150, 2)]
@@ -67,7 +67,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, small, c
     cli.main([*command, "--episodes", "2", "--workers", "1", "--checkpoints", "1"])
     names = {path.name for path in (tmp_path / "policies").iterdir()}
     assert names == {"drawer-open_stopped_000150.npz", "mine.npz", "policies.json"}
-    with pytest.raises(SystemExit, match="name: is not the only one of stopped, stopped"):
+    with pytest.raises(SystemExit, match="name: is not unique among stopped, stopped"):
         cli.main([*command[:2], str(tmp_path / "other/stopped"), *command[2:]])
     policies = load_policies(tmp_path / "policies")
     policies["drawer-open"][0].file.write_bytes(b"others")
@@ -79,15 +79,15 @@ def test_training_ends_when_two_evaluations_in_a_row_are_good():
     def curve(*successes):
         return [{"step": str(i * 50), "successes": str(n), "episodes": "20"} for i, n in enumerate(successes, start=1)]
 
-    assert train_sac._is_done(curve(0, 18, 20), 1000)
-    assert not train_sac._is_done(curve(18, 0, 20), 1000)
-    assert not train_sac._is_done(curve(18), 1000) and train_sac._is_done(curve(0, 0), 100)
+    assert training._is_done(curve(0, 18, 20), 1000)
+    assert not training._is_done(curve(18, 0, 20), 1000)
+    assert not training._is_done(curve(18), 1000) and training._is_done(curve(0, 0), 100)
 
 
 def test_the_actor_in_numpy_is_that_of_sb3():
-    env = train_sac.gym.make(train_sac.ENV_ID, obs_type="state")
+    env = training.gym.make(training.ENV_ID, obs_type="state")
     model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16, 12]}, buffer_size=1, seed=0, device="cpu")
-    offset, scale = train_sac._state_scaling(env)
+    offset, scale = training._state_scaling(env)
     actor = SacActor(actor_weights({name: p.numpy() for name, p in model.actor.state_dict().items()}, offset, scale))
     states = np.stack([env.reset(seed=i)[0] for i in range(3)])
     scaled = ((states - offset) / scale).astype(np.float32)

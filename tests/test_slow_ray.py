@@ -12,8 +12,8 @@ import ray
 from ray.cluster_utils import Cluster
 
 from sb3_offline.data.reader import OfflineDataset, open_datasets
-from sb3_offline.data_tools.collect_ray import collect_on_ray
-from sb3_offline.data_tools.collect_sac import Collection, collect_shard, content_hash, shard_path
+from sb3_offline.data_tools.collecting.on_ray import collect_on_ray
+from sb3_offline.data_tools.collecting.sac import Collection, collect_shard, content_hash, shard_path
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from ray.cluster_utils import Cluster
 
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.on_ray import train_on_ray
-from sb3_offline.benchmark.worker import train_run
+from sb3_offline.benchmark.worker import complete_run
 from sb3_offline.experiment.training import RESUME_FILE, load_run
 
 pytestmark = pytest.mark.slow
@@ -46,7 +46,7 @@ def test_a_killed_node_loses_nothing(tmp_path):
         cluster.shutdown()
     assert {run.label for run in over} == {run.label for run in lost.values()}
     for run in whole.values():
-        train_run(run)
+        complete_run(run)
     assert rows_of(lost) == rows_of(whole)
     for one, same in zip(lost.values(), whole.values(), strict=True):
         assert_same(*(load_run(run.folder / "model.zip")[0].get_parameters() for run in (one, same)))

@@ -1,1 +1,1 @@
-"""Tables of runs: a grid of methods, tasks and seeds from one YAML file becomes a CSV file, whatever is killed on the way."""
+"""Tables of runs: a grid of methods, tasks and seeds in one YAML file becomes a CSV file. Killed runs continue exactly."""

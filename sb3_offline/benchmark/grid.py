@@ -1,4 +1,4 @@
-"""What is trained and how it is counted: one YAML file."""
+"""A grid: the methods, tasks and seeds of a table and its protocol, read from one YAML file."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
@@ -8,7 +8,9 @@ from typing import Any, TypeAlias
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.experiment.config import load_config, read_yaml
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
-from sb3_offline.experiment.training import EvaluationTable, find_algorithm, is_finished, run_record
+from sb3_offline.experiment.evaluation_table import EvaluationTable
+from sb3_offline.experiment.run import TrainingRun
+from sb3_offline.experiment.training import find_algorithm
 
 #: Method, task and seed.
 Cell: TypeAlias = tuple[str, str, int]
@@ -17,11 +19,11 @@ Cell: TypeAlias = tuple[str, str, int]
 @dataclass(frozen=True)
 class Method:
     """
-    A row of the table.
+    One row of the table.
 
     :param algo: name in :data:`sb3_offline.ALGOS`
-    :param config: a shipped config's name or a YAML file
-    :param changes: what is changed in it; dicts are joined
+    :param config: name of a shipped config, or a YAML file
+    :param changes: entries that replace those of the config; dicts are merged
     """
 
     algo: str
@@ -35,22 +37,22 @@ class Method:
 @dataclass(frozen=True)
 class Grid:
     """
-    A table of methods, tasks and seeds, and its protocol, which is fixed before any run: a cell counts by its last
-    ``checkpoints`` checkpoints, evenly spaced over the last half of its gradient steps (five: at 60, 70, 80, 90 and 100 %),
-    with ``episodes`` episodes each. These are other ones at each checkpoint and for each seed, but the same for all cells of
-    a seed. No checkpoint is chosen.
+    A table of methods, tasks and seeds, with a protocol that is fixed before any run. A cell counts by its last
+    ``checkpoints`` checkpoints, evenly spaced over the last half of its gradient steps (five of them: at 60, 70, 80, 90 and
+    100 %). Each plays ``episodes`` episodes. The episodes differ between checkpoints and between seeds, and are the same for
+    all cells of a seed. No checkpoint is selected.
 
     :param env: id of the environment
-    :param methods: name of the row to what it is
-    :param tasks: each becomes the environment's keyword argument ``task``
-    :param seeds: of the runs
-    :param n_timesteps: gradient steps, the same for every method
-    :param dataset: path, pattern, or a list of these; ``{task}`` in it stands for the task
-    :param examples: path of the success examples, likewise; for the methods that learn from them
-    :param env_kwargs: of the environment, beside the configs'
-    :param save_freq: gradient steps between two saves, which a killed run goes on from
-    :param checkpoints: that count
-    :param episodes: of each
+    :param methods: methods by the name of their row
+    :param tasks: values of the environment's keyword argument ``task``
+    :param seeds: seeds of the runs
+    :param n_timesteps: number of gradient steps, the same for every method
+    :param dataset: path, pattern, or a list of these; ``{task}`` in a text stands for the task
+    :param examples: path of the success examples, for the methods that learn from them; ``{task}`` stands for the task
+    :param env_kwargs: keyword arguments of the environment, in addition to those of the configs
+    :param save_freq: gradient steps between two saves, from which a killed run continues
+    :param checkpoints: number of checkpoints that count
+    :param episodes: number of episodes that each checkpoint plays
     """
 
     env: str
@@ -76,11 +78,11 @@ class Grid:
         self, methods: Iterable[str] | None = None, tasks: Iterable[str] | None = None, seeds: Iterable[int] | None = None
     ) -> list[Cell]:
         """
-        :param methods: to keep (default: all)
-        :param tasks: likewise
-        :param seeds: likewise
-        :return: method, task and seed of each cell. Seeds are outermost, so that a grid that was stopped early is one of fewer
-            seeds.
+        :param methods: methods to keep (default: all)
+        :param tasks: tasks to keep (default: all)
+        :param seeds: seeds to keep (default: all)
+        :return: method, task and seed of each cell. The seeds are outermost, so that a grid that stops early is a complete
+            grid of fewer seeds.
         """
         chosen: dict[str, list[Any]] = {}
         for name, wanted in {"methods": methods, "tasks": tasks, "seeds": seeds}.items():
@@ -92,42 +94,45 @@ class Grid:
         return [(name, task, seed) for seed in chosen["seeds"] for task in chosen["tasks"] for name in chosen["methods"]]
 
     def evaluation_steps(self) -> list[int]:
-        """:return: steps of the checkpoints that count"""
+        """:return: gradient steps of the checkpoints that count"""
         spacing = self.n_timesteps // (2 * self.checkpoints)
         return [spacing * (self.checkpoints + 1 + index) for index in range(self.checkpoints)]
 
 
 @dataclass(frozen=True)
-class Run:
+class GridRun:
     """
-    One training. It fills one cell of the table; or one of each task, where nothing that is learned from depends on the task:
-    trained once, its policies are evaluated on all of them, by the same protocol and with the same outcome as if it had been
-    trained once for each.
+    One training run of a grid. It fills one cell of the table, or the cells of all tasks if nothing that it learns from
+    depends on the task: then the policy is trained once and evaluated on every task, with the same protocol and the same
+    outcome as if it had been trained once for each.
 
     :param label: method, tasks and seed in words
-    :param folder: of its files
-    :param tasks: that it is evaluated on
-    :param arguments: of :func:`~sb3_offline.experiment.training.train`
-    :param grid: that it is of
+    :param tasks: the tasks that the policy is evaluated on
+    :param training: what is trained
+    :param grid: the parent grid
     """
 
     label: str
-    folder: Path
     tasks: tuple[str, ...]
-    arguments: dict[str, Any]
+    training: TrainingRun
     grid: Grid
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the run's files."""
+        return self.training.output
+
     def tables(self) -> list[EvaluationTable]:
-        """:return: of each task, the callback that evaluates the run's policy"""
+        """:return: for each task, the callback that evaluates the policy"""
         return [self.table(task) for task in self.tasks]
 
     def table(self, task: str) -> EvaluationTable:
         """
-        :param task: one of the run's
-        :return: the callback that evaluates the run's policy on it
+        :param task: one of the run's tasks
+        :return: the callback that evaluates the policy on this task
         """
-        grid, config = self.grid, self.arguments["config"]
-        n_early, seed = grid.checkpoints, self.arguments["seed"]  # those of the first half are for the learning curve
+        grid, config = self.grid, self.training.config
+        n_early, seed = grid.checkpoints, self.training.seed  # evaluations in the first half are for the learning curve
         return EvaluationTable(
             self.folder / f"evaluations-{task}.csv",
             grid.env,
@@ -138,20 +143,16 @@ class Run:
             seeds=[evaluation_seed(seed, (n_early + index) % (2 * n_early)) for index in range(2 * n_early)],
         )
 
-    def record(self) -> dict[str, Any]:
-        """:return: what ``config.yml`` in the folder says when it was trained with these arguments"""
-        return run_record(**self.arguments)
-
     def is_finished(self) -> bool:
-        """:return: whether it was trained and evaluated to the end"""
+        """:return: True if the policy is trained and fully evaluated"""
         whole = all(table.is_complete(self.grid.n_timesteps) for table in self.tables())
-        return whole and is_finished(self.folder, self.arguments)
+        return whole and self.training.is_finished()
 
 
 def load_grid(name: str) -> Grid:
     """
-    :param name: a YAML file, or a shipped grid's name (``"table1_states"``)
-    :return: what it holds
+    :param name: a YAML file, or the name of a shipped grid (``"table1_states"``)
+    :return: the grid; raises ``RuntimeError`` if an entry is missing or wrong
     """
     path, content = read_yaml(name, "grid", "grids/")
     content = _checked(content, Grid, f"{path}")
@@ -185,22 +186,23 @@ def _checked(section: Any, kind: type, place: str) -> dict[str, Any]:
     return dict(section)
 
 
-def plan(grid: Grid, runs: Path, chosen: Sequence[Cell] | None = None) -> dict[Cell, Run]:
+def plan(grid: Grid, runs: Path, chosen: Sequence[Cell] | None = None) -> dict[Cell, GridRun]:
     """
-    :param grid: whose cells are filled
+    Find the runs that fill the cells of a grid.
+
+    :param grid: the grid
     :param runs: folder of all runs
     :param chosen: some of :meth:`Grid.cells` (default: all)
-    :return: of each of these, the run that fills it. What is trained once for all tasks is evaluated on all of the grid's,
-        whichever are chosen.
+    :return: the run of each chosen cell. A run for all tasks is evaluated on all tasks of the grid, whichever are chosen.
     """
     folders = [_folder_name(name) for name in grid.methods]
     if len({*folders}) < len(folders):
         raise RuntimeError(f"Two of the methods would share a folder of {', '.join(sorted(folders))}; rename one")
     chosen = grid.cells() if chosen is None else chosen
-    methods = {name: grid.methods[name] for name, _, _ in chosen}  # configs of the others are not looked for
+    methods = {name: grid.methods[name] for name, _, _ in chosen}  # the configs of other methods may be missing
     configs = {name: merged(load_config(method.config, grid.env), method.changes) for name, method in methods.items()}
-    of_all_tasks: dict[tuple[str, int], Run] = {}
-    cells: dict[Cell, Run] = {}
+    of_all_tasks: dict[tuple[str, int], GridRun] = {}
+    cells: dict[Cell, GridRun] = {}
     for name, task, seed in chosen:
         if _depends_on_task(grid, methods[name], configs[name]):
             cells[name, task, seed] = _run(grid, name, configs[name], seed, task, [task], runs)
@@ -211,28 +213,32 @@ def plan(grid: Grid, runs: Path, chosen: Sequence[Cell] | None = None) -> dict[C
     return cells
 
 
-def _run(grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | None, tasks: Sequence[str], runs: Path) -> Run:
+def _run(
+    grid: Grid, name: str, config: dict[str, Any], seed: int, task: str | None, tasks: Sequence[str], runs: Path
+) -> GridRun:
     """
-    :param config: of the method
-    :param task: that it is trained for; ``None`` for a run of all tasks
-    :param tasks: that it is evaluated on
+    :param name: name of the method
+    :param config: config of the method
+    :param task: the task to train for; ``None`` for a run of all tasks
+    :param tasks: the tasks to evaluate on
     """
     method = grid.methods[name]
     dataset, examples = _data(grid, method)
     if _takes_examples(method) and examples is None:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
     env_kwargs = {**config.get("env_kwargs", {}), **grid.env_kwargs}
-    arguments = {
-        "algo": method.algo,
-        "env_id": grid.env,
-        "config": {**config, "env_kwargs": env_kwargs, "n_timesteps": grid.n_timesteps},
-        "output": _run_folder(runs, name, seed, task),
-        "dataset": _filled(dataset, tasks[0]),
-        "examples": _filled(examples, tasks[0]),
-        "env_kwargs": {"task": task} if task else {},
-        "seed": seed,
-    }
-    return Run(f"{name} {', '.join(tasks)} seed {seed}", arguments["output"], tuple(tasks), arguments, grid)
+    training = TrainingRun(
+        method.algo,
+        grid.env,
+        {**config, "env_kwargs": env_kwargs, "n_timesteps": grid.n_timesteps},
+        _run_folder(runs, name, seed, task),
+        dataset=_filled(dataset, tasks[0]),
+        examples=_filled(examples, tasks[0]),
+        env_kwargs={"task": task} if task else {},
+        seed=seed,
+        save_freq=grid.save_freq,
+    )
+    return GridRun(f"{name} {', '.join(tasks)} seed {seed}", tuple(tasks), training, grid)
 
 
 def _takes_examples(method: Method) -> bool:
@@ -240,26 +246,26 @@ def _takes_examples(method: Method) -> bool:
 
 
 def _depends_on_task(grid: Grid, method: Method, config: dict[str, Any]) -> bool:
-    """:return: whether a policy learns from anything that is another one for another task: examples, files, or episodes"""
+    """:return: True if the examples, the files or the episodes that a method learns from differ between tasks"""
     return any("{task}" in str(text) for text in (*_data(grid, method), config.get("episodes")))
 
 
 def _data(grid: Grid, method: Method) -> tuple[Any, Any]:
-    """:return: where a method's dataset and examples are: the grid's, unless its changes say otherwise"""
+    """:return: paths of a method's dataset and examples: those of its changes, or else of the grid"""
     dataset, examples = (method.changes.get(name, getattr(grid, name)) for name in ("dataset", "examples"))
     return dataset, examples if _takes_examples(method) else None
 
 
 def _filled(paths: Any, task: str) -> Any:
-    """:return: the path or the paths of a task"""
+    """:return: the path or the paths for a task"""
     return [_filled(path, task) for path in paths] if isinstance(paths, list) else paths and paths.replace("{task}", task)
 
 
 def evaluation_seed(seed: int, checkpoint: int) -> int:
     """
-    :param seed: of a run
-    :param checkpoint: 0 for the first one that counts
-    :return: seed of that evaluation's episodes
+    :param seed: seed of a run
+    :param checkpoint: index of the checkpoint; 0 is the first one that counts
+    :return: seed of the episodes of that evaluation
     """
     return EVALUATION_SEED + 1000 * (1 + seed) + checkpoint
 
@@ -267,10 +273,10 @@ def evaluation_seed(seed: int, checkpoint: int) -> int:
 def cell_folder(runs: Path, method: str, task: str, seed: int) -> Path:
     """
     :param runs: folder of all runs
-    :param method: of a cell
-    :param task: of it
-    :param seed: of it
-    :return: folder of the run that fills it
+    :param method: method of the cell
+    :param task: task of the cell
+    :param seed: seed of the cell
+    :return: folder of the run that fills the cell
     """
     own = _run_folder(runs, method, seed, task)
     return own if own.is_dir() else _run_folder(runs, method, seed, None)
@@ -281,15 +287,15 @@ def _run_folder(runs: Path, method: str, seed: int, task: str | None) -> Path:
 
 
 def _folder_name(name: str) -> str:
-    """:return: a row's name without what folders should not have"""
+    """:return: the name of a row without characters that folders should not have"""
     return "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in name)
 
 
 def merged(config: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """
-    :param config: of an algorithm
-    :param changes: to it
-    :return: the config with the changes in it, where dicts are joined
+    :param config: config of an algorithm
+    :param changes: new values
+    :return: the config with the new values; dicts are merged
     """
     return {
         **config,

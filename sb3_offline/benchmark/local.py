@@ -1,65 +1,42 @@
-"""The runs of a grid on this machine: a process each, one thread each, as many at once as there are cores."""
+"""Train the runs of a grid on this machine, in one process of one thread each."""
 
-import multiprocessing
 import sys
-from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from multiprocessing.connection import wait
-from typing import Any
 
-from sb3_offline.benchmark.grid import Run
-from sb3_offline.benchmark.worker import record_failure, train_run
+from sb3_offline.benchmark.grid import GridRun
+from sb3_offline.benchmark.worker import complete_run, record_failure
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data_tools.workers import prepare_worker
+from sb3_offline.parallel.processes import run_with_restarts
 
-#: A run whose process is killed so many times has failed: it may need more memory than there is.
-MOST_KILLS = 3
-_IN_USE = 75  # the exit code of a process that found another one at its run
+MOST_DEATHS = 3
+"""Number of times a run's process may die before the run counts as failed: it may need more memory than there is."""
+_IN_USE = 75  # exit code of a process whose run another process is training
 
 
-def train_locally(runs: Iterable[Run], n_workers: int) -> Iterator[Run]:
+def train_locally(runs: Iterable[GridRun], n_workers: int) -> Iterator[GridRun]:
     """
-    :param runs: that are not finished, in the order in which to start them
-    :param n_workers: processes; one where fewer are asked for
-    :return: each run when it is finished or has failed. Where a process is killed, another goes on with its run, but not for
-        ever. Raises ``RuntimeError`` at the end where runs are left to other processes
+    Train runs. When a process is killed, another one continues its run, up to :data:`MOST_DEATHS` times.
+
+    :param runs: unfinished runs; they start in this order
+    :param n_workers: number of processes at a time, at least one
+    :return: each run when it is finished or has failed; raises ``RuntimeError`` at the end if other processes train some of
+        the runs
     """
-    context = multiprocessing.get_context("spawn")
-    waiting, left = deque(runs), []
-    working: dict[Any, tuple[Any, Run]] = {}
-    kills: Counter[str] = Counter()
-    try:
-        while waiting or working:
-            while waiting and len(working) < max(n_workers, 1):
-                run = waiting.popleft()
-                process = context.Process(target=_work, args=(run,))
-                process.start()
-                working[process.sentinel] = process, run
-            for sentinel in wait(list(working)):
-                process, run = working.pop(sentinel)
-                process.join()
-                if process.exitcode == 0:
-                    yield run
-                    continue
-                kills[run.label] += 1
-                if process.exitcode == _IN_USE:
-                    left.append(run.label)
-                elif kills[run.label] < MOST_KILLS:
-                    waiting.appendleft(run)
-                else:
-                    record_failure(run, f"its process died {MOST_KILLS} times, with exit code {process.exitcode}")
-                    yield run
-    finally:
-        for process, _ in working.values():
-            process.terminate()
+    left = []
+    for run, code in run_with_restarts(_work, runs, n_workers, most_deaths=MOST_DEATHS, final_codes=[_IN_USE]):
+        if code == _IN_USE:
+            left.append(run.label)
+            continue
+        if code != 0:
+            record_failure(run, f"its process died {MOST_DEATHS} times, with exit code {code}")
+        yield run
     if left:
-        raise RuntimeError(f"Other processes are at these runs: {'; '.join(left)}. Start the same command again afterwards")
+        raise RuntimeError(f"Other processes train these runs: {'; '.join(left)}. Start the same command again afterwards")
 
 
-def _work(run: Run) -> None:
-    prepare_worker()
+def _work(run: GridRun) -> None:
     try:
-        train_run(run)
+        complete_run(run)
     except DatasetError as error:
         print(error, file=sys.stderr)
         sys.exit(_IN_USE)

@@ -1,28 +1,31 @@
-"""From a grid to its table."""
+"""Train a grid and write its table."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from sb3_offline.benchmark.grid import Cell, Grid, Run
+from sb3_offline.benchmark.grid import Cell, Grid, GridRun
 from sb3_offline.benchmark.table import failure_of, table_writer
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.policy_file import save_policy
+from sb3_offline.experiment.run import MODEL_FILE
 from sb3_offline.experiment.training import load_run
 
 
 def run_grid(
-    grid: Grid, cells: Mapping[Cell, Run], output: Path, train: Callable[[list[Run]], Iterable[Run]] | None
+    grid: Grid, cells: Mapping[Cell, GridRun], output: Path, train: Callable[[list[GridRun]], Iterable[GridRun]] | None
 ) -> Iterator[str]:
     """
-    Train what is not finished, and write the table at once and after every run; all evaluations, for learning curves, go to
+    Train the unfinished runs, and write the table at the start and after every run. All evaluations, for learning curves, go
+    to
     :func:`~sb3_offline.benchmark.table.curves_file`.
 
-    :param grid: whose table it is
-    :param cells: to fill, of :func:`~sb3_offline.benchmark.grid.plan`; rows in ``output`` of the grid's other cells stay
-    :param output: CSV file
-    :param train: trains runs and gives back each when it is over; ``None`` to write the table of what is finished
-    :return: what to tell the user, when it happens
+    :param grid: the grid
+    :param cells: cells to fill, from :func:`~sb3_offline.benchmark.grid.plan`; rows of other cells of the grid stay in the
+        table
+    :param output: the CSV file
+    :param train: trains runs and yields each when it ends; ``None`` only writes the table of the finished runs
+    :return: messages for the user, as they arise
     """
     began = time.monotonic()
     write = table_writer(output, grid, cells)
@@ -37,29 +40,31 @@ def run_grid(
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
 
 
-def export_policies(cells: Mapping[Cell, Run], runs: Path, folder: Path) -> int:
+def export_policies(cells: Mapping[Cell, GridRun], runs: Path, folder: Path) -> int:
     """
-    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
+    Save the final policy of each finished run in a small file, named like the folder of the run.
+
+    :param cells: from :func:`~sb3_offline.benchmark.grid.plan`
     :param runs: folder of the runs
-    :param folder: gets the final policy of each finished run as a file named like the run's folder
-    :return: how many there are
+    :param folder: folder for the policies
+    :return: number of policies
     """
     finished = {run.folder for run in cells.values() if run.is_finished()}
     for source in sorted(finished):
-        save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / "model.zip"))
+        save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / MODEL_FILE))
     return len(finished)
 
 
-def _check_files(runs: list[Run]) -> None:
-    """A path that is wrong for all of them would make a failure of each."""
-    for dataset in {str(run.arguments["dataset"]): run.arguments["dataset"] for run in runs}.values():
+def _check_files(runs: list[GridRun]) -> None:
+    """Raise an error for a missing file before any run starts, since it would make every run fail."""
+    for dataset in {str(run.training.dataset): run.training.dataset for run in runs}.values():
         open_datasets(dataset)
-    for examples in sorted({run.arguments["examples"] for run in runs if run.arguments["examples"]}):
+    for examples in sorted({run.training.examples for run in runs if run.training.examples}):
         if not Path(examples).exists():
             raise RuntimeError(f"{examples}: there are no such success examples; make them, or correct `examples:`")
 
 
-def _outcome(run: Run) -> str:
+def _outcome(run: GridRun) -> str:
     failure = failure_of(run)
     if failure:
         return f"failed: {failure}"

@@ -1,4 +1,4 @@
-"""The CSV files of a grid: a row for each checkpoint that counts, and beside it one for each evaluation."""
+"""The two CSV files of a grid: one with a row for each checkpoint that counts, one with a row for each evaluation."""
 
 import csv
 import json
@@ -6,28 +6,27 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_offline.benchmark.grid import Cell, Grid, Run
+from sb3_offline.benchmark.grid import Cell, Grid, GridRun
 from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
 from sb3_offline.data.files import locked_folder, replacing
-from sb3_offline.experiment.training import recorded_run
 
 FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
 CURVE_FIELDS = ("method", "task", "seed", "step", "episodes", "successes")
 
 
-def table_writer(output: Path, grid: Grid, cells: Mapping[Cell, Run]) -> Callable[[], None]:
+def table_writer(output: Path, grid: Grid, cells: Mapping[Cell, GridRun]) -> Callable[[], None]:
     """
-    :param output: the table's CSV file
-    :param grid: whose table it is
-    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`; rows of the grid's other cells stay
-    :return: writes the table and the file of all evaluations beside it, as things stand
+    :param output: the CSV file of the table
+    :param grid: the grid
+    :param cells: from :func:`~sb3_offline.benchmark.grid.plan`; rows of other cells of the grid stay in the files
+    :return: a function that writes both CSV files in their current state
     """
-    order = {cell: number for number, cell in enumerate(grid.cells())}
+    order = {cell: position for position, cell in enumerate(grid.cells())}
     files = [(output, FIELDS, table_rows), (curves_file(output), CURVE_FIELDS, curve_rows)]
 
     def write() -> None:
         output.parent.mkdir(parents=True, exist_ok=True)
-        with locked_folder(output.parent):  # another process may be at other cells of the same table
+        with locked_folder(output.parent):  # another process may write other cells of the same table
             for path, fields, rows_of in files:
                 rows = [*_rows_of(path, {*order} - {*cells}, fields), *rows_of(cells)]
                 write_table(path, sorted(rows, key=lambda row: order[row["method"], row["task"], int(row["seed"])]), fields)
@@ -35,11 +34,11 @@ def table_writer(output: Path, grid: Grid, cells: Mapping[Cell, Run]) -> Callabl
     return write
 
 
-def table_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
+def table_rows(cells: Mapping[Cell, GridRun]) -> list[dict[str, Any]]:
     """
-    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
-    :return: rows of :data:`FIELDS` of the cells that are finished or have failed. In a failed one the checkpoints that it
-        never reached count as so many failures, and ``config`` says what went wrong.
+    :param cells: from :func:`~sb3_offline.benchmark.grid.plan`
+    :return: rows with the columns :data:`FIELDS`, for the cells that are finished or have failed. In a failed cell, the
+        checkpoints that it never reached count as failed episodes, and ``config`` holds the error.
     """
     rows = []
     for (method, task, seed), run in cells.items():
@@ -47,7 +46,7 @@ def table_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
         if not (failure or run.is_finished()):
             continue
         grid = run.grid
-        reached = run.table(task).rows(grid.n_timesteps) if recorded_run(run.folder) == run.record() else []
+        reached = run.table(task).rows(grid.n_timesteps) if run.training.is_recorded() else []
         found = {int(row["step"]): row for row in reached}
         provenance = run.folder / PROVENANCE_FILE
         missing: dict[str, Any] = {"episodes": grid.episodes, "successes": 0}
@@ -60,15 +59,15 @@ def table_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def curve_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
+def curve_rows(cells: Mapping[Cell, GridRun]) -> list[dict[str, Any]]:
     """
-    :param cells: of :func:`~sb3_offline.benchmark.grid.plan`
-    :return: rows of :data:`CURVE_FIELDS` of the cells that are finished or have failed: all their evaluations, also those of
-        the first half of a run, which do not count
+    :param cells: from :func:`~sb3_offline.benchmark.grid.plan`
+    :return: rows with the columns :data:`CURVE_FIELDS`, for the cells that are finished or have failed. They hold all
+        evaluations, also those in the first half of a run, which do not count.
     """
     rows = []
     for (method, task, seed), run in cells.items():
-        if run.is_finished() or (failure_of(run) and recorded_run(run.folder) == run.record()):
+        if run.is_finished() or (failure_of(run) and run.training.is_recorded()):
             named = {"method": method, "task": task, "seed": seed}
             found = run.table(task).rows(run.grid.n_timesteps)
             rows += [{**named, **{name: int(row[name]) for name in CURVE_FIELDS[3:]}} for row in found]
@@ -78,39 +77,44 @@ def curve_rows(cells: Mapping[Cell, Run]) -> list[dict[str, Any]]:
 def curves_file(table: Path) -> Path:
     """
     :param table: CSV file of a grid
-    :return: the file of all its evaluations, which stands beside it
+    :return: the CSV file of all evaluations, in the same folder
     """
     return table.with_name(f"{table.stem}_curves.csv")
 
 
 def _rows_of(path: Path, wanted: set[Cell], fields: Sequence[str]) -> list[dict[str, Any]]:
     """
-    :param path: of the CSV file of an earlier call, if there was one
+    :param path: the CSV file, which an earlier call may have written
     :param wanted: cells
     :param fields: columns of the file
-    :return: rows in the file of these cells
+    :return: the rows of these cells
     """
     if not path.is_file():
         return []
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         if reader.fieldnames is None or [*reader.fieldnames] != [*fields]:
-            raise RuntimeError(f"{path}: is no table of sb3-offline benchmark, which would replace it; name another --output")
+            raise RuntimeError(
+                f"{path}: is not a table of sb3-offline benchmark and would be overwritten; name another --output"
+            )
         return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in wanted]
 
 
-def failure_of(run: Run) -> str | None:
-    """:return: what went wrong in a run, if it did"""
+def failure_of(run: GridRun) -> str | None:
+    """
+    :param run: a run
+    :return: the error that ended the run, or ``None``
+    """
     file = run.folder / FAILURE_FILE
     failure = json.loads(file.read_text()) if file.is_file() else {}
-    return failure["error"] if failure.get("run") == run.record() else None
+    return failure["error"] if failure.get("run") == run.training.record() else None
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], fields: Sequence[str] = FIELDS) -> None:
     """
-    :param path: of the CSV file, which a reader finds whole at any time
-    :param rows: of :func:`table_rows`
-    :param fields: columns
+    :param path: the CSV file, which is replaced at once, so that readers always find a whole file
+    :param rows: rows, such as those of :func:`table_rows`
+    :param fields: columns of the file
     """
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, fields)

@@ -1,6 +1,5 @@
-"""One run of a grid, in a process of its own: on this machine or on a cluster."""
+"""Complete one run of a grid in the current process, whether on this machine or on a cluster."""
 
-import importlib.metadata
 import json
 import os
 import traceback
@@ -9,63 +8,64 @@ from pathlib import Path
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_offline.benchmark.grid import Run
-from sb3_offline.common.provenance import current_commit
+from sb3_offline.benchmark.grid import GridRun
+from sb3_offline.common.provenance import TRAINING_PACKAGES, current_commit, installed_versions
 from sb3_offline.data.files import lock_file, replacing
-from sb3_offline.experiment.training import train
+from sb3_offline.experiment.training import train_run
 
 FAILURE_FILE, PROVENANCE_FILE, LOCK_FILE = "failure.json", "provenance.json", "lock"
 THEN = " then "
-_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "metaworld", "mujoco")
 
 
-def train_run(run: Run) -> None:
+def complete_run(run: GridRun) -> None:
     """
-    Train a run of a grid, or go on with it, unless it is finished. What goes wrong in it is written down in its folder; a run
-    that failed before is tried again, from its last save on.
+    Train a run of a grid, or continue it, unless it is finished. An error in the run is recorded in its folder. A run that
+    failed earlier is tried again from its last save.
 
-    :param run: what to do; raises ``DatasetError`` where another process is at it
+    :param run: the run; raises ``DatasetError`` if another process is training it
     """
     th.set_num_threads(1)
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOCK_FILE).open("a") as lock:
         lock_file(lock, run.folder)
         lock.truncate(0)
-        lock.write(f"{os.getpid()}")  # for whoever wonders what is at it
+        lock.write(f"{os.getpid()}")  # tells the user which process is training
         lock.flush()
         if run.is_finished():
-            (run.folder / FAILURE_FILE).unlink(missing_ok=True)  # left by a kill between the two
+            (run.folder / FAILURE_FILE).unlink(missing_ok=True)  # a kill may have come before the removal below
             return
         try:
-            callbacks = [_Provenance(run.folder / PROVENANCE_FILE), *run.tables()]
-            train(**run.arguments, callbacks=callbacks, save_freq=run.grid.save_freq, progress_bar=False)
+            train_run(run.training, callbacks=[_Provenance(run.folder / PROVENANCE_FILE), *run.tables()], progress_bar=False)
         except Exception as error:
             record_failure(run, f"{type(error).__name__}: {error}", traceback.format_exc())
         else:
             (run.folder / FAILURE_FILE).unlink(missing_ok=True)
 
 
-def record_failure(run: Run, error: str, details: str = "") -> None:
+def record_failure(run: GridRun, error: str, details: str = "") -> None:
     """
-    :param run: that failed
-    :param error: what the table is to say
-    :param details: what else might help
+    Record in the folder of a run that it failed.
+
+    :param run: the run
+    :param error: short text for the table
+    :param details: further information, such as a traceback
     """
     run.folder.mkdir(parents=True, exist_ok=True)
-    failure = {"error": " ".join(error.split()), "run": run.record(), "traceback": details}
+    failure = {"error": " ".join(error.split()), "run": run.training.record(), "traceback": details}
     with replacing(run.folder / FAILURE_FILE) as temporary:
         temporary.write_text(json.dumps(failure, indent=1))
 
 
 class _Provenance(BaseCallback):
-    """Leaves beside a run which code made it: of each commit, where a run went on with another one."""
+    """Records commit and package versions beside a run: several of each if the run continued with other code."""
 
     def __init__(self, path: Path):
         super().__init__()
         self.path = path
 
     def _on_training_start(self) -> None:
-        now = {"commit": current_commit(), "versions": versions()}
+        versions = ", ".join(f"{name} {version}" for name, version in installed_versions(TRAINING_PACKAGES).items())
+        now = {"commit": current_commit(), "versions": versions}
         before = json.loads(self.path.read_text()) if self.num_timesteps and self.path.is_file() else {}
         for name, earlier in before.items():
             is_same = earlier.split(THEN)[-1] == now[name]
@@ -75,14 +75,3 @@ class _Provenance(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-
-def versions() -> str:
-    """:return: of the packages that decide what comes out"""
-    installed = []
-    for name in _PACKAGES:
-        try:
-            installed.append(f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return ", ".join(installed)

@@ -1,13 +1,22 @@
-"""Which code makes what is left behind."""
+"""Which code and which packages produced a file."""
 
+import importlib.metadata
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 
 import sb3_offline
 
+SIMULATION_PACKAGES = ("metaworld", "mujoco", "gymnasium", "numpy")
+"""The packages that decide what happens in an episode."""
+TRAINING_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "metaworld", "mujoco")
+"""The packages that decide the result of a training run and its evaluation."""
+
 
 def current_commit() -> str:
-    """:return: the commit that the code is of, with a + where the code differs from it; "unknown" outside of a repository"""
+    """
+    :return: the commit of this code, with a + if the code differs from it; "unknown" outside a repository
+    """
     root = Path(sb3_offline.__file__).parent.parent
     code = ["sb3_offline", "zoo_configs", "data_tools"]
 
@@ -16,7 +25,21 @@ def current_commit() -> str:
 
     try:
         if not git("ls-files", "sb3_offline/version.txt"):
-            return "unknown"  # the repository is of something else, in which this package is installed
+            return "unknown"  # the package is installed inside another project's repository
         return git("rev-parse", "--short=9", "HEAD") + "+" * bool(git("status", "--porcelain", *code))
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """
+    :param packages: names of packages
+    :return: version by name, without the packages that are not installed
+    """
+    versions = {}
+    for name in packages:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions

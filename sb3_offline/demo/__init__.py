@@ -1,1 +1,1 @@
-"""The main job end to end: collect, train, evaluate, report. Thin over the other rooms."""
+"""The demo: collect data, train, evaluate and report, with the functions of the other packages."""

@@ -1,4 +1,4 @@
-"""From nothing to a trained policy and a report in one folder."""
+"""The whole demo: from nothing to trained policies and a report in one folder."""
 
 import csv
 import json
@@ -15,18 +15,19 @@ import sb3_offline
 from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.data.examples import save_examples
 from sb3_offline.data.reader import OfflineDataset
-from sb3_offline.data_tools.collect_scripted import BEHAVIOUR, TASKS, collect_scripted
-from sb3_offline.data_tools.extract_examples import extract_examples
+from sb3_offline.data_tools.collecting.scripted import BEHAVIOUR, TASKS, collect_scripted
+from sb3_offline.data_tools.converting.extract_examples import extract_examples
 from sb3_offline.demo import plots
 from sb3_offline.demo.trajectories import judge_trajectories, pick_trajectories
 from sb3_offline.envs import ENV_ID
 from sb3_offline.experiment.config import load_config
 from sb3_offline.experiment.evaluation import evaluate_success, success_interval
-from sb3_offline.experiment.parallel import train_in_parallel
+from sb3_offline.experiment.parallel_training import train_in_parallel
 from sb3_offline.experiment.recording import record_gif
+from sb3_offline.experiment.run import MODEL_FILE, TrainingRun
 from sb3_offline.experiment.training import load_run
 
-#: Rows of the table: label, algorithm, config.
+#: Rows of the table: algorithm and config by label.
 METHODS = {
     "CEBORL": ("ceborl", "ceborl"),
     "CEBORL, the paper's form": ("ceborl", "ceborl_paper"),
@@ -38,21 +39,21 @@ RESULT_FIELDS = ("method", "task", "obs_type", "seed", "steps", "episodes", "suc
 @dataclass(frozen=True)
 class DemoSettings:
     """
-    What a demo does; fixed before it runs.
+    The settings of a demo.
 
-    :param task: what is to be learned
+    :param task: the task to learn
     :param obs_type: "state" or "pixels"
-    :param episodes_per_task: attempts at each of the five tasks in the unlabelled dataset
-    :param example_episodes: attempts at the task, apart from the dataset, that examples are taken from
-    :param judged_episodes: further attempts, which nobody learns from, to look at the classifier with
-    :param n_examples: success examples
-    :param n_timesteps: gradient steps of each method; ``None`` for the configs'
-    :param n_curve_points: evaluations along each run
-    :param n_curve_episodes: episodes of each
-    :param n_final_episodes: episodes of the final policies
-    :param methods: which of :data:`METHODS`
-    :param seed: of everything
-    :param n_workers: processes, one thread each
+    :param episodes_per_task: number of attempts at each of the five tasks in the unlabelled dataset
+    :param example_episodes: number of further attempts at the task, from which the examples are drawn
+    :param judged_episodes: number of further attempts, which no method learns from, for the figure of the classifier
+    :param n_examples: number of success examples
+    :param n_timesteps: gradient steps of each method (default: those of the configs)
+    :param n_curve_points: number of evaluations along each run
+    :param n_curve_episodes: number of episodes in each of these
+    :param n_final_episodes: number of episodes that each final policy plays
+    :param methods: some of :data:`METHODS`
+    :param seed: seed of the data and the runs
+    :param n_workers: number of processes, with one thread each
     """
 
     task: str = "drawer-open"
@@ -72,11 +73,11 @@ class DemoSettings:
 
 def run_demo(output: Path, settings: DemoSettings) -> str:
     """
-    Collect, train, evaluate and report. Data that are complete from an earlier run are used again.
+    Collect, train, evaluate and report. Complete data of an earlier demo are used again.
 
-    :param output: folder, created; ``report.md`` in it shows the rest
-    :param settings: what to do
-    :return: the report's text
+    :param output: folder, which is created; ``report.md`` in it shows the results
+    :param settings: the settings
+    :return: text of the report
     """
     began = time.monotonic()
     data = collect(output / "data", settings)
@@ -87,7 +88,7 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
     env_kwargs = {"task": settings.task, "obs_type": settings.obs_type}
     rows = [behaviour_row(data["dataset"], settings)]
     for method, run in runs.items():
-        model, config = load_run(run["output"] / "model.zip")
+        model, config = load_run(run.output / MODEL_FILE)
         print(f"Playing {settings.n_final_episodes} episodes of {method}")
         result = evaluate_success(model, ENV_ID, env_kwargs, settings.n_final_episodes)
         rows.append(result_row(method, settings, config["n_timesteps"], settings.n_final_episodes, sum(result.successes)))
@@ -97,49 +98,50 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
             record_gif(model, ENV_ID, env_kwargs, output / "policy.gif")
             judged = judge_trajectories(model, OfflineDataset(data["judged"]))
             plots.plot_classifier(judged, pick_trajectories(judged), output / "classifier.png")
-    plots.plot_curves({method: run["output"] for method, run in runs.items()}, output / "learning_curve.png")
+    plots.plot_learning_curves({method: run.output for method, run in runs.items()}, output / "learning_curve.png")
     with (output / "results.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, RESULT_FIELDS)
         writer.writeheader()
         writer.writerows(rows)
-    report = write_report(output, settings, rows, time.monotonic() - began)
-    return report
+    return write_demo_report(output, settings, rows, time.monotonic() - began)
 
 
-def training_run(method: str, output: Path, data: dict[str, Path], settings: DemoSettings) -> dict[str, Any]:
+def training_run(method: str, output: Path, data: dict[str, Path], settings: DemoSettings) -> TrainingRun:
     """
-    :param method: of :data:`METHODS`
-    :param output: the demo's folder
-    :param data: what :func:`collect` returned
-    :param settings: what to do
-    :return: arguments of :func:`~sb3_offline.experiment.training.train`
+    :param method: one of :data:`METHODS`
+    :param output: folder of the demo
+    :param data: files from :func:`collect`
+    :param settings: the settings
+    :return: the training run of this method
     """
     algo, config_name = METHODS[method]
     config = load_config(config_name + ("_pixels" if settings.obs_type == "pixels" else ""), ENV_ID)
     if settings.n_timesteps:
         config["n_timesteps"] = settings.n_timesteps
-    return {
-        "algo": algo,
-        "env_id": ENV_ID,
-        "config": config,
-        "output": output / "runs" / config_name,
-        "dataset": str(data["dataset"]),
-        "examples": None if algo == "bc" else str(data["examples"]),
-        "env_kwargs": {"task": settings.task},
-        "seed": settings.seed,
-        "eval_freq": max(config["n_timesteps"] // settings.n_curve_points, 1),
-        "n_eval_episodes": settings.n_curve_episodes,
-    }
+    return TrainingRun(
+        algo,
+        ENV_ID,
+        config,
+        output / "runs" / config_name,
+        dataset=str(data["dataset"]),
+        examples=None if algo == "bc" else str(data["examples"]),
+        env_kwargs={"task": settings.task},
+        seed=settings.seed,
+        eval_freq=max(config["n_timesteps"] // settings.n_curve_points, 1),
+        n_eval_episodes=settings.n_curve_episodes,
+    )
 
 
 def collect(folder: Path, settings: DemoSettings) -> dict[str, Path]:
     """
-    :param folder: for the files
-    :param settings: how much to collect
-    :return: ``dataset`` (unlabelled for the learners), ``examples``, and ``judged``
+    Collect the data, unless they are complete from an earlier demo.
+
+    :param folder: folder for the files
+    :param settings: the settings
+    :return: paths of the files: ``dataset`` (which learners see without labels), ``examples`` and ``judged``
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # The names say what is in the files, so that other settings do not find the wrong ones.
+    # The names tell the settings, so that a demo with other settings does not use these files.
     stem = f"{settings.obs_type}-{settings.episodes_per_task}-seed{settings.seed}"
     source_stem = f"{settings.obs_type}-{settings.task}-{settings.example_episodes}-seed{settings.seed + 1}"
     judged_stem = f"{settings.obs_type}-{settings.task}-{settings.judged_episodes}-seed{settings.seed + 2}"
@@ -151,9 +153,9 @@ def collect(folder: Path, settings: DemoSettings) -> dict[str, Path]:
     }
     print(f"Collecting {len(TASKS) * settings.episodes_per_task} episodes: {BEHAVIOUR}")
     _collect_once(paths["dataset"], settings.episodes_per_task, TASKS, settings.obs_type, settings.seed)
-    print(f"Collecting attempts at {settings.task}: {settings.example_episodes} for success examples, apart from those")
+    print(f"Collecting {settings.example_episodes} further attempts at {settings.task} for success examples")
     _collect_once(source, settings.example_episodes, (settings.task,), settings.obs_type, settings.seed + 1)
-    print(f"and {settings.judged_episodes} to look at the classifier with")
+    print(f"Collecting {settings.judged_episodes} further attempts for the figure of the classifier")
     _collect_once(paths["judged"], settings.judged_episodes, (settings.task,), settings.obs_type, settings.seed + 2)
     examples, provenance = extract_examples(source, settings.n_examples, seed=settings.seed, held_out=True)
     save_examples(paths["examples"], examples, OfflineDataset(source).observation_space, provenance)
@@ -167,9 +169,9 @@ def _collect_once(path: Path, episodes_per_task: int, tasks: tuple[str, ...], ob
 
 def behaviour_row(dataset: Path, settings: DemoSettings) -> dict[str, Any]:
     """
-    :param dataset: what the learners see
-    :param settings: which task
-    :return: how often all that was collected solves the task: what a perfect imitation of it would reach
+    :param dataset: the dataset to learn from
+    :param settings: the settings
+    :return: the row of the behaviour policy: how often the collected episodes solve the task, as a perfect imitation would
     """
     data = OfflineDataset(dataset)
     solved = np.logical_or.reduceat(data.extras["task_success"][:, TASKS.index(settings.task)], data.step_starts)
@@ -177,7 +179,7 @@ def behaviour_row(dataset: Path, settings: DemoSettings) -> dict[str, Any]:
 
 
 def result_row(method: str, settings: DemoSettings, steps: int, episodes: int, successes: int) -> dict[str, Any]:
-    """:return: values of :data:`RESULT_FIELDS`"""
+    """:return: a row with the columns :data:`RESULT_FIELDS`"""
     low, high = success_interval(successes, episodes)
     values = (
         method,
@@ -195,7 +197,7 @@ def result_row(method: str, settings: DemoSettings, steps: int, episodes: int, s
 
 def result_table(rows: list[dict[str, Any]]) -> str:
     """
-    :param rows: of ``results.csv``
+    :param rows: rows of ``results.csv``
     :return: a Markdown table
     """
     lines = ["| method | gradient steps | solved | success rate (95 % interval) |", "|---|---|---|---|"]
@@ -206,12 +208,12 @@ def result_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def write_report(output: Path, settings: DemoSettings, rows: list[dict[str, Any]], seconds: float) -> str:
+def write_demo_report(output: Path, settings: DemoSettings, rows: list[dict[str, Any]], seconds: float) -> str:
     """
-    :param output: the demo's folder
-    :param settings: what was done
-    :param rows: of the table
-    :param seconds: wall time
+    :param output: folder of the demo
+    :param settings: the settings
+    :param rows: rows of the table
+    :param seconds: duration of the demo
     :return: the text of ``report.md``
     """
     machine = f"{settings.n_workers} processes, PyTorch {th.__version__}, Python {platform.python_version()}"
@@ -219,8 +221,9 @@ def write_report(output: Path, settings: DemoSettings, rows: list[dict[str, Any]
 
 {result_table(rows)}
 
-Success: the task was solved at any decision of an episode. Seed {settings.seed}; the last policy of each run, no checkpoint
-was chosen. The data: {BEHAVIOUR}; {settings.episodes_per_task} episodes of each of five tasks, no rewards, no task labels.
+An episode succeeds if it solves the task after any decision. Each run has seed {settings.seed} and counts by its last policy;
+no checkpoint was selected. The data: {BEHAVIOUR}; {settings.episodes_per_task} episodes of each of five tasks, without rewards
+or task labels.
 
 ![The policy](policy.gif)
 

@@ -1,4 +1,4 @@
-"""The demo's pictures."""
+"""The figures of the demo."""
 
 import csv
 from pathlib import Path
@@ -15,13 +15,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 COLORS = {True: "#1b7f4b", False: "#b3402e"}
-N_PICTURES = 6
+N_FRAMES = 6
 
 
-def plot_curves(runs: dict[str, Path], path: Path) -> None:
+def plot_learning_curves(runs: dict[str, Path], path: Path) -> None:
     """
-    :param runs: label to the folder of a run
-    :param path: of the PNG
+    :param runs: folder of each run by label
+    :param path: the PNG file
     """
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
     for (label, folder), style in zip(runs.items(), ("-o", "--s", ":^"), strict=False):
@@ -39,16 +39,17 @@ def plot_curves(runs: dict[str, Path], path: Path) -> None:
 
 def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Path) -> None:
     """
-    The odds along a successful and a failed attempt, in front of the spread of all of their kind, over pictures of both.
+    Draw the odds along a successful and a failed attempt, each with the spread of all attempts of its kind, and frames of
+    both.
 
-    :param judged: trajectories
-    :param pair: indices of the successful and the failed one
-    :param path: of the PNG
+    :param judged: all trajectories
+    :param pair: indices of the successful and the failed attempt
+    :param path: the PNG file
     """
     n_decisions = judged.odds.shape[1]
-    pictured = np.linspace(0, n_decisions - 1, N_PICTURES).round().astype(int)
+    shown = np.linspace(0, n_decisions - 1, N_FRAMES).round().astype(int)
     figure = plt.figure(figsize=(8, 6.4), layout="constrained")
-    grid = figure.add_gridspec(3, N_PICTURES, height_ratios=[2.4, 1, 1])
+    grid = figure.add_gridspec(3, N_FRAMES, height_ratios=[2.4, 1, 1])
     axes = figure.add_subplot(grid[0, :])
     for index, solved in zip(pair, (True, False), strict=True):
         color, word = COLORS[solved], "successful" if solved else "failed"
@@ -68,13 +69,13 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Pat
     env: Any = gym.make(ENV_ID, obs_type="state").unwrapped
     for row, (index, solved) in enumerate(zip(pair, (True, False), strict=True), start=1):
         env.reset(seed=int(judged.seeds[index]))
-        for column, decision in enumerate(pictured):
+        for column, decision in enumerate(shown):
             env.scene.set_state(judged.scene_state[index, decision])
-            cell = figure.add_subplot(grid[row, column])
-            cell.imshow(env.get_picture(200, 200))
-            cell.set(xticks=[], yticks=[])
-            cell.set_title(f"decision {decision}", fontsize=8, color=COLORS[solved])
-            cell.spines[:].set_color(COLORS[solved])
+            panel = figure.add_subplot(grid[row, column])
+            panel.imshow(env.get_picture(200, 200))
+            panel.set(xticks=[], yticks=[])
+            panel.set_title(f"decision {decision}", fontsize=8, color=COLORS[solved])
+            panel.spines[:].set_color(COLORS[solved])
     env.close()
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -1,1 +1,1 @@
-"""Runs: a config becomes a trained policy, a policy becomes a success rate. Knows algorithms, datasets and environments."""
+"""Single runs: train a policy from a config, and measure how often it succeeds."""

@@ -1,4 +1,4 @@
-"""Hyperparameters from YAML files in the form of the RL Zoo: a section per environment id."""
+"""Read hyperparameters from YAML files in the form of the RL Zoo, with one section per environment id."""
 
 import ast
 import re
@@ -11,7 +11,7 @@ import yaml
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 3e-4 for a number, as YAML 1.2 and Python do, and not for text."""
+    """Reads 3e-4 as a number, as YAML 1.2 and Python do, and not as text."""
 
 
 _FLOAT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$")
@@ -20,8 +20,8 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456
 
 def config_path(name: str) -> Path:
     """
-    :param name: a file that comes with the package (``"ceborl"``), or a path of one's own
-    :return: the file
+    :param name: name of a file that comes with the package (``"ceborl"``), or the path of any YAML file
+    :return: path of the file
     """
     own = Path(name)
     if own.suffix in (".yml", ".yaml"):
@@ -32,9 +32,9 @@ def config_path(name: str) -> Path:
 def read_yaml(name: str, kind: str, folder: str = "") -> tuple[Path, Any]:
     """
     :param name: a YAML file, or the name of a shipped one
-    :param kind: what it is called where it is missing
-    :param folder: of the shipped ones, inside ``zoo_configs``, with a slash at its end
-    :return: the file, and what it holds
+    :param kind: kind of the file, for the error message if it is missing
+    :param folder: folder of the shipped files inside ``zoo_configs``, with a slash at its end
+    :return: path of the file, and its content
     """
     path = config_path(name if Path(name).suffix else folder + name)
     if not path.is_file():
@@ -49,12 +49,13 @@ def read_yaml(name: str, kind: str, folder: str = "") -> tuple[Path, Any]:
 def load_config(name: str, env_id: str) -> dict[str, Any]:
     """
     :param name: see :func:`config_path`
-    :param env_id: section to read; ``default`` where the file has no such section
-    :return: constructor arguments of the algorithm, and ``policy``, ``n_timesteps``, ``env_kwargs``
+    :param env_id: section to read; if the file has no such section, it is ``default``
+    :return: constructor arguments of the algorithm, ``policy`` among them, and ``n_timesteps`` and ``env_kwargs``; raises
+        ``RuntimeError`` if the file or the section is missing or wrong
     """
     path, sections = read_yaml(name, "config file")
     if not isinstance(sections, dict):
-        raise RuntimeError(f"{path}: has no sections; write `{env_id}:` and hyperparameters below it, indented")
+        raise RuntimeError(f"{path}: has no sections; write `{env_id}:` and the hyperparameters below it, indented")
     section = sections.get(env_id, sections.get("default"))
     if not isinstance(section, dict):
         raise RuntimeError(f"{path}: has no section {env_id!r} and no 'default'; its sections are {sorted(sections)}")
@@ -75,9 +76,9 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     """
-    :param pairs: ``key:value`` as in the RL Zoo's ``--hyperparams``; values are Python literals, ``dict(name=literal)``, or
-        else strings
-    :return: the same as a dict
+    :param pairs: ``key:value``, as in the RL Zoo's ``--hyperparams``. Values are Python literals or ``dict(name=literal)``;
+        any other text is a string.
+    :return: values by key
     """
     overrides = {}
     for pair in pairs:
@@ -90,8 +91,8 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 def python_value(text: str) -> Any:
     """
-    :param text: as in files of the RL Zoo
-    :return: what a Python literal, or ``dict(name=literal)``, says; any other text as it is
+    :param text: text from a file of the RL Zoo
+    :return: the value of a Python literal or of ``dict(name=literal)``; any other text unchanged
     """
     try:
         return _literal(ast.parse(text.strip(), mode="eval").body)
@@ -107,7 +108,7 @@ def _literal(node: ast.expr) -> Any:
 
 def number_or_text(value: Any) -> Any:
     """
-    :param value: of a file that a YAML 1.1 loader read, as the RL Zoo's does
-    :return: what this module's loader reads: a number in place of the text "3e-4"
+    :param value: value that a YAML 1.1 loader, such as the RL Zoo's, read from a file
+    :return: the value that this module's loader reads: a number in place of the text "3e-4"
     """
     return float(value) if isinstance(value, str) and _FLOAT.match(value) else value

@@ -1,4 +1,4 @@
-"""How often a policy succeeds."""
+"""Measure how often a policy succeeds."""
 
 import math
 from dataclasses import dataclass
@@ -10,15 +10,17 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-#: Far from the seeds that data are collected with.
+#: Seed of the first episode, far from the seeds of collected data.
 EVALUATION_SEED = 100_000
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """
-    :param successes: whether each episode solved the task at any of its steps
-    :param returns: sum of rewards of each episode
+    Outcome of an evaluation.
+
+    :param successes: for each episode, True if it solved the task at any step
+    :param returns: for each episode, its sum of rewards
     """
 
     successes: list[bool]
@@ -26,20 +28,21 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float:
+        """Share of solved episodes."""
         return float(np.mean(self.successes))
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the success rate (Wilson's)."""
+        """Wilson's 95 % interval of the success rate."""
         return success_interval(sum(self.successes), len(self.successes))
 
 
 def success_interval(successes: int, episodes: int) -> tuple[float, float]:
     """
-    Wilson's 95 % interval: unlike the normal approximation it says something at 0 and at 1.
+    Compute Wilson's 95 % interval. Unlike the normal approximation, it is informative at rates of 0 and 1.
 
-    :param successes: episodes that succeeded
-    :param episodes: all episodes
+    :param successes: number of episodes that succeeded
+    :param episodes: number of all episodes
     :return: lower and upper end
     """
     z = 1.959964
@@ -51,10 +54,10 @@ def success_interval(successes: int, episodes: int) -> tuple[float, float]:
 
 def make_evaluation_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> VecEnv:
     """
-    :param env_id: registered id
-    :param env_kwargs: of the environment
-    :param seed: of its episodes; the same seed gives the same starts
-    :return: one environment with SB3's ``Monitor``
+    :param env_id: registered id of the environment
+    :param env_kwargs: keyword arguments of the environment
+    :param seed: seed of its episodes; the same seed gives the same initial states
+    :return: a vectorized environment of one, with SB3's ``Monitor``
     """
     return make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
 
@@ -63,27 +66,27 @@ def evaluate_success(
     model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], n_episodes: int = 50, seed: int = EVALUATION_SEED
 ) -> Evaluation:
     """
-    Play the policy's mode. The environment is new at each call, so that the same seed gives the same episodes.
+    Play the mode of a policy. Each call creates the environment, so that the same seed gives the same episodes.
 
-    :param model: a model, or a policy of one
-    :param env_id: registered id; its ``info`` must say ``is_success``
-    :param env_kwargs: of the environment
-    :param n_episodes: how many, at least one
-    :param seed: of the episodes
-    :return: what came out
+    :param model: a model or a policy
+    :param env_id: registered id of the environment, whose ``info`` must hold ``is_success``
+    :param env_kwargs: keyword arguments of the environment
+    :param n_episodes: number of episodes, at least one
+    :param seed: seed of the episodes
+    :return: successes and returns
     """
     if n_episodes < 1:
-        raise ValueError(f"{n_episodes} episodes say nothing; play at least one")
+        raise ValueError(f"n_episodes is {n_episodes}; play at least one")
     env = make_evaluation_env(env_id, env_kwargs, seed)
     successes: list[bool] = []
     solved = False
 
     def at_step(local: dict[str, Any], _: dict[str, Any]) -> None:
         nonlocal solved
-        solved |= bool(local["info"].get("is_success"))  # at any step: not every environment keeps it up to the last
+        solved |= bool(local["info"].get("is_success"))  # at any step: not every environment still reports it at the last one
         if local["done"]:
             if "is_success" not in local["info"]:
-                raise RuntimeError(f"{env_id} does not say `is_success` in its info, so success cannot be counted")
+                raise RuntimeError(f"The info of {env_id} holds no `is_success`, so success cannot be counted")
             successes.append(solved)
             solved = False
 

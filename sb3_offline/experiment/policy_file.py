@@ -1,4 +1,4 @@
-"""What plays, and nothing else: the actor's weights in a small file."""
+"""Small files that hold the weights of an actor, and nothing else of a model."""
 
 import json
 import zipfile
@@ -22,11 +22,12 @@ _KEPT = ("algo", "env", "env_kwargs", "seed", "n_timesteps", "policy", "policy_k
 
 def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> None:
     """
-    Matrices are kept with a byte a weight, as multiples of a unit that each row has: a quarter of their size.
+    Save the actor of a model. Matrices take one byte per weight, a quarter of their size: weights are rounded to multiples of
+    a unit, which each row has for itself.
 
-    :param path: of the ``.npz`` file
-    :param model: whose actor is kept
-    :param config: of its run, as :func:`~sb3_offline.experiment.training.load_run` returns it
+    :param path: the ``.npz`` file
+    :param model: the model
+    :param config: record of its run, as :func:`~sb3_offline.experiment.training.load_run` returns it
     """
     weights = {name: value.cpu().numpy() for name, value in model.actor.state_dict().items()}
     for name in [name for name, parameter in model.actor.named_parameters() if parameter.dim() > 1]:
@@ -44,8 +45,8 @@ def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> 
 
 def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
     """
-    :param path: of a file of :func:`save_policy`
-    :return: a policy that plays nearly as the model did, whose critic is no one's; and the config of its run
+    :param path: a file of :func:`save_policy`
+    :return: a policy that plays nearly as the model did, with an untrained critic; and the record of its run
     """
     try:
         with np.load(path) as file:
@@ -53,7 +54,7 @@ def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
         config = json.loads(str(arrays.pop(_DESCRIPTION)))
         spaces = [space_from_json(config.pop(name)) for name in ("observation_space", "action_space")]
     except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
-        raise RuntimeError(f"{path}: is not a policy of sb3-offline benchmark --policies ({error})") from error
+        raise RuntimeError(f"{path}: is not a policy file of sb3-offline benchmark --policies ({error})") from error
     kwargs = {key: config[key] for key in ("policy", "policy_kwargs") if key in config}
     model = create_model(config["algo"], kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))
     for name in [name for name in arrays if name + _UNIT in arrays]:

@@ -1,4 +1,4 @@
-"""Episodes as pictures."""
+"""Record episodes as images."""
 
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,13 @@ LAST_FRAME_MS = 800
 
 def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None) -> tuple[list[np.ndarray], int | None]:
     """
-    :param model: plays its mode
-    :param env: with ``render_mode="rgb_array"``
-    :param seed: of the episode; ``None`` goes on with the environment's own generator
-    :return: frames uint8, one a decision, until the task is solved and a little longer; and the decision that
-        solved it, if one did
+    Play one episode with the mode of a policy, until the task is solved and a little longer.
+
+    :param model: a model or a policy
+    :param env: environment with ``render_mode="rgb_array"``
+    :param seed: seed of the episode; ``None`` continues with the environment's own generator
+    :return: frames uint8, before the first decision and after each; and the index of the decision that solved the task, or
+        ``None``
     """
     observation, _ = env.reset(seed=seed)
     frames, solved_at, solved_for, done = [env.render()], None, 0, False
@@ -37,20 +39,20 @@ def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None
 
 def make_recording_env(env_id: str, env_kwargs: dict[str, Any], size: int) -> gym.Env:
     """
-    :param env_id: registered id
-    :param env_kwargs: of the environment
-    :param size: width and height of its pictures, where it can be told
-    :return: the environment, which draws pictures
+    :param env_id: registered id of the environment
+    :param env_kwargs: keyword arguments of the environment
+    :param size: width and height of the images, if the environment takes ``width`` and ``height``
+    :return: an environment that renders images; raises ``RuntimeError`` if it cannot
     """
     arguments = {**env_kwargs, "render_mode": "rgb_array"}
     try:
         return gym.make(env_id, **{"width": size, "height": size, **arguments})
-    except TypeError:  # it takes no size
+    except TypeError:  # the environment takes no size
         pass
     try:
         return gym.make(env_id, **arguments)
     except TypeError as error:
-        raise RuntimeError(f"{env_id} draws no pictures ({error})") from error
+        raise RuntimeError(f"{env_id} renders no images ({error})") from error
 
 
 def record_gif(
@@ -63,32 +65,32 @@ def record_gif(
     size: int = 200,
 ) -> list[bool]:
     """
-    The first episodes of :func:`~sb3_offline.experiment.evaluation.evaluate_success` with this seed, whatever comes of
-    them, one after the other in a GIF.
+    Record episodes one after the other in a GIF. They are the first episodes, unselected, that
+    :func:`~sb3_offline.experiment.evaluation.evaluate_success` plays with this seed.
 
-    :param model: plays its mode
-    :param env_id: registered id
-    :param env_kwargs: of the environment
-    :param path: of the GIF
-    :param n_episodes: how many
-    :param seed: of the first; the others go on with the same generator
+    :param model: a model or a policy, which plays its mode
+    :param env_id: registered id of the environment
+    :param env_kwargs: keyword arguments of the environment
+    :param path: the GIF
+    :param n_episodes: number of episodes
+    :param seed: seed of the first episode; the others continue with the same generator
     :param size: width and height in pixels
-    :return: which of them were solved
+    :return: for each episode, True if it was solved
     """
     env = make_recording_env(env_id, env_kwargs, size)
-    pictures, durations, outcomes = [], [], []
+    images, durations, outcomes = [], [], []
     for index in range(n_episodes):
         frames, solved_at = record_episode(model, env, seed if index == 0 else None)
         solved = solved_at is not None
         outcomes.append(solved)
-        for number, frame in enumerate(frames):
-            picture = Image.fromarray(frame)
-            last = number == len(frames) - 1
+        for position, frame in enumerate(frames):
+            image = Image.fromarray(frame)
+            last = position == len(frames) - 1
             text = f"episode {index + 1}" + (f": {'solved' if solved else 'failed'}" if last else "")
-            ImageDraw.Draw(picture).text((6, 4), text, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
-            pictures.append(picture.quantize(128, dither=Image.Dither.NONE))
+            ImageDraw.Draw(image).text((6, 4), text, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
+            images.append(image.quantize(128, dither=Image.Dither.NONE))
             durations.append(LAST_FRAME_MS if last else FRAME_MS)
     env.close()
     path.parent.mkdir(parents=True, exist_ok=True)
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
     return outcomes

@@ -1,1 +1,1 @@
-"""What a grid's CSV file says: tables, figures, and the policies at play. Trains nothing."""
+"""Report on the CSV file of a grid: tables, figures, and episodes of the final policies. It trains nothing."""

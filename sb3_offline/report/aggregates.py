@@ -1,4 +1,4 @@
-"""Methods compared over all tasks, with rliable: interquartile means and probabilities of improvement."""
+"""Compare methods over all tasks with rliable: interquartile means and probabilities of improvement."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +15,10 @@ REPETITIONS = 1000
 @dataclass(frozen=True)
 class Estimate:
     """
+    An estimate and its uncertainty.
+
     :param value: the estimate
-    :param interval: 95 %, by a bootstrap over seeds within each task; ``None`` where there is only one seed
+    :param interval: 95 % interval of a bootstrap over the seeds within each task; ``None`` if there is only one seed
     """
 
     value: float
@@ -28,11 +30,11 @@ class Estimate:
 
 def scores(results: Results) -> dict[str, np.ndarray]:
     """
-    :param results: ours
-    :return: success rates of each method that has been run on all tasks, ``(seeds, tasks)``
+    :param results: results of a grid
+    :return: for each method that has run on all tasks, its ``(seeds, tasks)`` success rates
     """
     return {
-        method: np.array([[results.cells[method, task].by("seed")[seed].rate for task in results.tasks] for seed in seeds])
+        method: np.array([[results.entries[method, task].by("seed")[seed].rate for task in results.tasks] for seed in seeds])
         for method in results.methods
         if (seeds := results.seeds(method))
     }
@@ -40,8 +42,8 @@ def scores(results: Results) -> dict[str, np.ndarray]:
 
 def interquartile_means(results: Results) -> dict[str, Estimate]:
     """
-    :param results: ours
-    :return: of each method the mean of the middle half of its runs, over seeds and tasks
+    :param results: results of a grid
+    :return: for each method, the mean of the middle half of its runs over seeds and tasks
     """
     own = scores(results)
     return _estimates(own, lambda rates: np.array([metrics.aggregate_iqm(rates)]), own)
@@ -49,9 +51,9 @@ def interquartile_means(results: Results) -> dict[str, Estimate]:
 
 def improvement_probabilities(results: Results, reference: str) -> dict[str, Estimate]:
     """
-    :param results: ours
-    :param reference: a method
-    :return: of each other method, how probable it is that a run of the reference does better on a task, over all tasks
+    :param results: results of a grid
+    :param reference: name of a method
+    :return: for each other method, the probability that a run of the reference does better on a task, averaged over the tasks
     """
     own = scores(results)
     pairs = {other: (own[reference], own[other]) for other in own if other != reference and reference in own}
@@ -62,7 +64,7 @@ def _estimates(samples: dict[str, Any], statistic: Callable[..., Any], own: dict
     if not samples:
         return {}
     state = np.random.get_state()
-    np.random.seed(0)  # rliable draws from NumPy's global generator; a report comes out the same each time
+    np.random.seed(0)  # rliable draws from NumPy's global generator, and each report should be the same
     try:
         points, intervals = library.get_interval_estimates(samples, statistic, reps=REPETITIONS)
     finally:
@@ -71,6 +73,6 @@ def _estimates(samples: dict[str, Any], statistic: Callable[..., Any], own: dict
     for name in samples:
         low, high = np.ravel(intervals[name])
         parts = samples[name] if isinstance(samples[name], tuple) else (own[name],)
-        several = all(len(part) > 1 for part in parts)  # of one seed, nothing can be drawn anew
+        several = all(len(part) > 1 for part in parts)  # a single seed cannot be resampled
         found[name] = Estimate(float(np.ravel(points[name])[0]), (float(low), float(high)) if several else None)
     return found

@@ -1,4 +1,4 @@
-"""Final policies at play, and what their critics make of it."""
+"""Play episodes of the final policies, with the values of their critics."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,16 +14,19 @@ from sb3_offline.experiment.recording import make_recording_env, record_episode
 from sb3_offline.experiment.training import load_run
 from sb3_offline.report.results import Results
 
-PICTURE_SIZE = 160
+FRAME_SIZE = 160
+"""Width and height of the frames in pixels."""
 
 
 @dataclass(frozen=True)
 class PlayedEpisode:
     """
-    :param frames: uint8, before the first decision and after each
-    :param solved_at: the decision that solved the task, if one did
-    :param values: of each decision; none where the method has no critic
-    :param value_name: what these are
+    One episode of a policy.
+
+    :param frames: uint8 images, before the first decision and after each
+    :param solved_at: index of the decision that solved the task, or ``None``
+    :param values: value of each decision; empty if the method has no critic
+    :param value_name: name of these values
     """
 
     frames: list[np.ndarray]
@@ -33,11 +36,12 @@ class PlayedEpisode:
 
     @property
     def solved(self) -> bool:
+        """True if the task was solved."""
         return self.solved_at is not None
 
 
 class _Watched:
-    """Plays like a model, and keeps what its critics make of each state and action: the lowest of them."""
+    """Plays like a model, and keeps the value of each state and action: the lowest of its critics."""
 
     def __init__(self, model: OfflineAlgorithm):
         self.model = model
@@ -55,30 +59,32 @@ class _Watched:
 
 def play_finals(results: Results, runs: Path) -> Iterator[tuple[str, str, PlayedEpisode]]:
     """
-    The first evaluation episode of the last checkpoint, of each method and task, whatever comes of it; of the first seed.
+    Play the first evaluation episode, unselected, of the last checkpoint and the first seed, for each method and task.
 
-    :param results: of the runs
-    :param runs: their folder
-    :return: method, task and episode; of the runs that are there
+    :param results: results of a grid
+    :param runs: folder of its runs
+    :return: method, task and episode, as far as the runs exist
     """
-    for (method, task), cell in results.cells.items():
-        seed = min(cell.by("seed"))
+    for (method, task), entry in results.entries.items():
+        seed = min(entry.by("seed"))
         model_file = cell_folder(runs, method, task, seed) / "model.zip"
         if model_file.is_file():
             model, config = load_run(model_file)
             env_kwargs = {**config["env_kwargs"], "task": task}
-            yield method, task, play(model, config["env"], env_kwargs, evaluation_seed(seed, len(cell.by("step")) - 1))
+            yield method, task, play(model, config["env"], env_kwargs, evaluation_seed(seed, len(entry.by("step")) - 1))
 
 
 def play(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any], seed: int) -> PlayedEpisode:
     """
-    :param model: plays its mode
-    :param env_id: registered id
-    :param env_kwargs: of the environment
-    :param seed: of the episode
-    :return: what came of it
+    Play one episode with the mode of a policy.
+
+    :param model: the model
+    :param env_id: registered id of the environment
+    :param env_kwargs: keyword arguments of the environment
+    :param seed: seed of the episode
+    :return: the episode
     """
-    env = make_recording_env(env_id, env_kwargs, PICTURE_SIZE)
+    env = make_recording_env(env_id, env_kwargs, FRAME_SIZE)
     watched = _Watched(model)
     try:
         frames, solved_at = record_episode(watched, env, seed)

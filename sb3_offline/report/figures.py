@@ -12,31 +12,34 @@ from sb3_offline.report.results import Results
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-N_PICTURES = 8
-SOLVED = {True: "#1b7f4b", False: "#b3402e"}
+N_FRAMES = 8
+OUTCOME_COLORS = {True: "#1b7f4b", False: "#b3402e"}
 
 
 def colors(results: Results) -> dict[str, tuple[float, float, float]]:
-    """:return: one for each method"""
+    """
+    :param results: results of a grid
+    :return: a color for each method
+    """
     return dict(zip(results.methods, plt.get_cmap("tab10").colors * 10, strict=False))  # type: ignore[attr-defined]
 
 
 def plot_table(results: Results, path: Path) -> None:
     """
-    A group of bars a task and one of the means, with 95 % intervals, and the paper's numbers as diamonds.
+    Draw a group of bars for each task and one for the means, with 95 % intervals, and the paper's rates as diamonds.
 
-    :param results: ours
-    :param path: of the PNG
+    :param results: results of a grid
+    :param path: the PNG file
     """
     paper, groups, width = results.paper, [*results.tasks, "all"], 0.8 / len(results.methods)
     figure, axes = plt.subplots(figsize=(11, 3.8), layout="constrained")
-    for number, (method, color) in enumerate(colors(results).items()):
-        places = np.arange(len(groups)) + (number - (len(results.methods) - 1) / 2) * width
+    for position, (method, color) in enumerate(colors(results).items()):
+        places = np.arange(len(groups)) + (position - (len(results.methods) - 1) / 2) * width
         for place, group in zip(places, groups, strict=True):
-            cell = results.cells.get((method, group))
-            if cell is not None:
-                error = [[max(cell.rate - cell.interval[0], 0)], [max(cell.interval[1] - cell.rate, 0)]]
-                axes.bar(place, cell.rate, width * 0.9, color=color, yerr=error, error_kw={"lw": 1, "ecolor": "0.3"})
+            entry = results.entries.get((method, group))
+            if entry is not None:
+                error = [[max(entry.rate - entry.interval[0], 0)], [max(entry.interval[1] - entry.rate, 0)]]
+                axes.bar(place, entry.rate, width * 0.9, color=color, yerr=error, error_kw={"lw": 1, "ecolor": "0.3"})
             elif group == "all" and method in results.means:
                 axes.bar(place, results.means[method], width * 0.9, color=color)
             if (method, group) in paper:
@@ -53,18 +56,18 @@ def plot_table(results: Results, path: Path) -> None:
 
 def plot_curves(results: Results, path: Path) -> None:
     """
-    A panel a task, a line a method: the success rate at each checkpoint, in front of its 95 % interval.
+    Draw a panel for each task and a line for each method: the success rate at each checkpoint and its 95 % interval.
 
-    :param results: ours
-    :param path: of the PNG
+    :param results: results of a grid
+    :param path: the PNG file
     """
     figure, panels = plt.subplots(
         1, len(results.tasks), figsize=(2.6 * len(results.tasks), 3.2), sharey=True, squeeze=False, layout="constrained"
     )
     for task, axes in zip(results.tasks, panels[0], strict=True):
         for method, color in colors(results).items():
-            if (method, task) in results.cells:
-                parts = results.cells[method, task].by("step")
+            if (method, task) in results.entries:
+                parts = results.entries[method, task].by("step")
                 low, high = zip(*(part.interval for part in parts.values()), strict=True)
                 axes.fill_between(list(parts), low, high, color=color, alpha=0.12, lw=0)
                 axes.plot(list(parts), [part.rate for part in parts.values()], "-o", markersize=3, color=color)
@@ -79,33 +82,33 @@ def plot_curves(results: Results, path: Path) -> None:
 
 def plot_strips(episodes: Mapping[str, PlayedEpisode], title: str, path: Path) -> None:
     """
-    A row of frames a method, evenly spaced over one episode.
+    Draw a row of frames for each method, evenly spaced over one episode.
 
-    :param episodes: of each method
-    :param title: what they have in common
-    :param path: of the picture
+    :param episodes: episodes by method
+    :param title: title of the figure
+    :param path: the image file
     """
-    size = (1.15 * N_PICTURES + 1.2, 1.32 * len(episodes) + 0.5)
-    figure, panels = plt.subplots(len(episodes), N_PICTURES, figsize=size, squeeze=False, layout="constrained")
+    size = (1.15 * N_FRAMES + 1.2, 1.32 * len(episodes) + 0.5)
+    figure, panels = plt.subplots(len(episodes), N_FRAMES, figsize=size, squeeze=False, layout="constrained")
     for (method, episode), row in zip(episodes.items(), panels, strict=True):
-        chosen = np.linspace(0, len(episode.frames) - 1, N_PICTURES).round().astype(int)
-        for axes, number in zip(row, chosen, strict=True):
-            axes.imshow(episode.frames[number])
+        chosen = np.linspace(0, len(episode.frames) - 1, N_FRAMES).round().astype(int)
+        for axes, decision in zip(row, chosen, strict=True):
+            axes.imshow(episode.frames[decision])
             axes.set(xticks=[], yticks=[])
-            axes.set_title(f"decision {number}", fontsize=7, pad=2)
-            axes.spines[:].set_color(SOLVED[episode.solved])
+            axes.set_title(f"decision {decision}", fontsize=7, pad=2)
+            axes.spines[:].set_color(OUTCOME_COLORS[episode.solved])
         word = "solved" if episode.solved else "failed"
-        row[0].set_ylabel(f"{method}\n{word}", fontsize=8, color=SOLVED[episode.solved])
+        row[0].set_ylabel(f"{method}\n{word}", fontsize=8, color=OUTCOME_COLORS[episode.solved])
     figure.suptitle(title, fontsize=10)
     _save(figure, path)
 
 
 def plot_values(episodes: Mapping[tuple[str, str], PlayedEpisode], path: Path) -> None:
     """
-    A row a method, a column a task: what the critic makes of each state and action of the episode.
+    Draw the values of each state and action of the episodes, with a row for each method and a column for each task.
 
-    :param episodes: by method and task; those of methods without a critic are left out
-    :param path: of the PNG
+    :param episodes: episodes by method and task; those of methods without a critic are left out
+    :param path: the PNG file
     """
     judged = {key: episode for key, episode in episodes.items() if episode.values}
     methods, tasks = ([*dict.fromkeys(key[place] for key in judged)] for place in (0, 1))
@@ -120,7 +123,7 @@ def plot_values(episodes: Mapping[tuple[str, str], PlayedEpisode], path: Path) -
                 axes.set_axis_off()
                 continue
             episode = judged[method, task]
-            axes.plot(episode.values, color=SOLVED[episode.solved], lw=1.2)
+            axes.plot(episode.values, color=OUTCOME_COLORS[episode.solved], lw=1.2)
             if episode.solved_at is not None:
                 axes.axvline(episode.solved_at, color="0.4", ls=":", lw=1)
             axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""One Markdown file with everything that CSV files and runs say."""
+"""Write the report: one Markdown file about the CSV files and the runs of grids."""
 
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
@@ -14,25 +14,29 @@ def write_report(
     tables: Sequence[Path], output: Path, runs: Sequence[Path] = (), reference: str = "ceborl", notes: Path | None = None
 ) -> Iterator[str]:
     """
+    Write ``report.md`` and its figures.
+
     :param tables: CSV files of ``sb3-offline benchmark``
-    :param output: folder for ``report.md`` and its figures
-    :param runs: folder of the runs of each table, for film strips and values; or none
+    :param output: folder for the report
+    :param runs: folder of the runs of each table, for film strips and values (default: leave these out)
     :param reference: the method that others are compared with
-    :param notes: a Markdown file to begin with: what the numbers cannot say, such as how hyperparameters were chosen
-    :return: what to tell the user, when it happens
+    :param notes: a Markdown file to begin with, about anything that numbers cannot show, such as the choice of hyperparameters
+    :return: messages for the user, as they arise
     """
     if runs and len(runs) != len(tables):
-        raise RuntimeError(f"There are {len(tables)} tables and {len(runs)} folders of runs; give one each, or no folder")
+        raise RuntimeError(
+            f"There are {len(tables)} tables and {len(runs)} folders of runs; give one folder for each table, or none"
+        )
     names = [table.stem for table in tables]
     if len({*names}) < len(names):
-        raise RuntimeError(f"{', '.join(map(str, tables))}: figures are named after tables; rename those of one name")
+        raise RuntimeError(f"{', '.join(map(str, tables))}: figures are named after tables; rename those of the same name")
     contents = [read_results(table) for table in tables]
     if not any(reference in results.methods for results in contents):
         raise RuntimeError(f"{', '.join(map(str, tables))}: there is no method {reference!r} to compare with (--reference)")
     parts = ["# Report", *([notes.read_text().strip()] if notes else [])]
     output.mkdir(parents=True, exist_ok=True)
     for table, results, folder in zip_longest(tables, contents, runs):
-        yield f"{table}: {len(results.cells)} cells"
+        yield f"{table}: {len(results.entries)} entries"
         parts += _section(results, output, reference)
         figures.plot_curves(with_early_checkpoints(results, table), output / f"{results.name}_curves.png")
         if folder is not None:
@@ -47,9 +51,10 @@ def _section(results: Results, output: Path, reference: str) -> list[str]:
     steps = sorted({int(row["step"]) for row in results.rows})
     return [
         f"## {results.name}",
-        f"Success rates of the checkpoints at steps {', '.join(map(str, steps))}; no checkpoint was chosen. In brackets "
-        "Wilson's 95 % intervals, as if all episodes were independent; those of one seed share a policy, so seeds tell more. "
-        "The paper's numbers are from its Table 1: three seeds, 500,000 steps, from pictures, on its own data.",
+        f"Success rates of the checkpoints at steps {', '.join(map(str, steps))}; no checkpoint was selected. Wilson's 95 % "
+        "intervals in parentheses treat all episodes as independent, although those of one seed share a policy, so seeds are "
+        "more informative. The paper's rates are those of its Table 1: three seeds, 500,000 steps, from images, on its own "
+        "data.",
         comparison_table(results),
         _ranking(results),
         *_failures(results),
@@ -76,7 +81,7 @@ def _failures(results: Results) -> list[str]:
     names = ("method", "task", "seed", "config")
     failed = sorted({tuple(row[name] for name in names) for row in results.rows if FAILED in row["config"]})
     lines = [f"- {method}, {task}, seed {seed}: {config.partition(FAILED)[2][:-1]}" for method, task, seed, config in failed]
-    about = "Runs that broke off; the checkpoints that they never reached count as failures:"
+    about = "These runs broke off. The checkpoints that they never reached count as failures:"
     return [about, "\n".join(lines)] if failed else []
 
 
@@ -88,10 +93,10 @@ def _aggregates(results: Results, reference: str) -> str:
         line = f"| {method} | {len(results.seeds(method))} | {mean} |"
         lines.append(line + f" {better.get(method, '')} |" * bool(better))
     about = (
-        "The interquartile mean is that of the middle half of all runs, over tasks and seeds. The probability is that of a "
-        f"run of {reference} beating one of the other method on the same task, ties counting half, averaged over the tasks. "
-        f"In brackets 95 % intervals from {REPETITIONS} bootstrap samples of the seeds, within each task (rliable); one seed "
-        "gives none. Methods that have not been run on all tasks are left out."
+        "The interquartile mean is the mean of the middle half of all runs, over tasks and seeds. The probability is that of "
+        f"a run of {reference} beating a run of the other method on the same task, averaged over the tasks; ties count half. "
+        f"The 95 % intervals in parentheses are from {REPETITIONS} bootstrap samples of the seeds within each task (rliable); "
+        "a single seed has none. Methods that have not run on all tasks are left out."
     )
     return "\n".join([*lines, "", about])
 
@@ -101,12 +106,12 @@ def _episodes(results: Results, runs: Path, output: Path) -> list[str]:
         (method, task): episode for method, task, episode in play_finals(results, runs)
     }
     if not played:
-        raise RuntimeError(f"{runs}: holds none of the runs of {results.name}; name the folder that was given as --runs")
-    parts = ["### The policies at play", "The first episode of the last evaluation, of the first seed, whatever came of it."]
+        raise RuntimeError(f"{runs}: holds no run of {results.name}; name the folder that was given to benchmark as --runs")
+    parts = ["### The policies at play", "The first episode, unselected, of the last evaluation of the first seed."]
     for task in results.tasks:
         episodes = {method: played[method, task] for method in results.methods if (method, task) in played}
         if episodes:
-            file = f"{results.name}_{task}.jpg"  # photographs: a fifth of the bytes of a PNG
+            file = f"{results.name}_{task}.jpg"  # a fifth of the size of a PNG
             figures.plot_strips(episodes, task, output / file)
             parts.append(f"![{task}: frames of an episode of each method]({file})")
     if any(episode.values for episode in played.values()):
@@ -114,8 +119,8 @@ def _episodes(results: Results, runs: Path, output: Path) -> list[str]:
         figures.plot_values(played, output / file)
         parts += [
             "### Values along these episodes",
-            "What the lower of the critics makes of each state and action: the probability of success C, or Q. Green: the "
-            "episode was solved, at the dotted line.",
+            "The lower value of the critics for each state and action: the probability of success C, or Q. Green episodes "
+            "were solved, at the dotted line.",
             f"![Values along the episodes]({file})",
         ]
     return parts

@@ -1,0 +1,1 @@
+"""Look into datasets: statistics, warnings, and a page for the browser."""

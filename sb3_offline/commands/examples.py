@@ -1,0 +1,31 @@
+"""``sb3-offline examples``"""
+
+import argparse
+import os
+
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.examples import save_examples
+from sb3_offline.data.reader import open_datasets
+from sb3_offline.data_tools.converting.extract_examples import extract_examples
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """:param parser: parser of the command"""
+    parser.add_argument("dataset", nargs="+", help="dataset files or patterns")
+    parser.add_argument("-o", "--output", required=True, help="HDF5 file to write")
+    parser.add_argument("-n", "--count", type=int, default=200, help="number of examples (default: 200)")
+    parser.add_argument("--source", help="use only episodes of this source, e.g. door-open")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
+    parser.add_argument("--held-out", action="store_true", help="record that these episodes are not learned from")
+    parser.add_argument("--overwrite", action="store_true", help="replace the output file")
+
+
+def run(args: argparse.Namespace) -> None:
+    """:param args: values of the options"""
+    if os.path.exists(args.output) and not args.overwrite:
+        raise DatasetError(args.output, "file", "exists already", "Give --overwrite to replace it")
+    datasets = open_datasets(args.dataset)
+    examples, provenance = extract_examples(datasets, args.count, source=args.source, seed=args.seed, held_out=args.held_out)
+    save_examples(args.output, examples, datasets[0].observation_space, provenance)
+    n_episodes = sum(len(origin["episodes"]) for origin in provenance["datasets"])
+    print(f"{args.count} examples from {n_episodes} episodes -> {args.output}")

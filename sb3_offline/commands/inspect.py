@@ -1,0 +1,29 @@
+"""``sb3-offline inspect``"""
+
+import argparse
+import json
+from pathlib import Path
+
+from sb3_offline.data_tools.inspecting.dataset_statistics import inspect_dataset
+from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
+from sb3_offline.data_tools.inspecting.page import write_page
+from sb3_offline.data_tools.inspecting.summary import format_summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """:param parser: parser of the command"""
+    parser.add_argument("dataset", nargs="+", help="dataset files or patterns; several are inspected together")
+    parser.add_argument("--html", type=Path, metavar="PAGE", help="also write a page for the browser, in one file")
+    parser.add_argument("--examples", help="success examples to compare with the data: folder, .npz, .npy or HDF5 file")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a text")
+
+
+def run(args: argparse.Namespace) -> None:
+    """:param args: values of the options"""
+    data = JoinedDatasets(args.dataset)
+    summary = inspect_dataset(data, args.examples)
+    print(json.dumps(summary, indent=2) if args.json else format_summary(summary))
+    if args.html:
+        write_page(args.html, data, summary, args.examples)
+        if not args.json:
+            print(f"\nPage: {args.html}")

@@ -1,0 +1,50 @@
+"""``sb3-offline train``"""
+
+import argparse
+from pathlib import Path
+
+from sb3_offline import ALGOS
+from sb3_offline.envs import ENV_ID
+from sb3_offline.experiment.config import load_config, parse_overrides
+from sb3_offline.experiment.run import MODEL_FILE, TrainingRun
+from sb3_offline.experiment.training import find_algorithm, train_run
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """:param parser: parser of the command"""
+    parser.add_argument("--algo", default="ceborl", help=f"one of {', '.join(ALGOS)} (default: ceborl)")
+    parser.add_argument("--env", default=ENV_ID, help=f"id of the environment to evaluate in (default: {ENV_ID})")
+    parser.add_argument("--task", help="task of the multimodal environment, e.g. door-open")
+    parser.add_argument("--config", help="name of a shipped config, or a YAML file (default: the algorithm's config)")
+    parser.add_argument("--dataset", nargs="+", help="dataset files or patterns (default: those of the config)")
+    parser.add_argument("--examples", help="folder of images, .npz, .npy or HDF5 file (default: the config's)")
+    parser.add_argument("-n", "--n-timesteps", type=int, help="number of gradient steps (default: that of the config)")
+    parser.add_argument("--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="replace values of the config")
+    parser.add_argument("--seed", type=int, default=0, help="seed of weights and batches (default: 0)")
+    parser.add_argument(
+        "--eval-freq", type=int, default=0, help="gradient steps between evaluations (default: no evaluations)"
+    )
+    parser.add_argument("--eval-episodes", type=int, default=20, help="number of episodes in each evaluation (default: 20)")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the model and its tables")
+
+
+def run(args: argparse.Namespace) -> None:
+    """:param args: values of the options"""
+    find_algorithm(args.algo)  # before its config is looked for
+    config = {**load_config(args.config or args.algo, args.env), **parse_overrides(args.hyperparams)}
+    if args.n_timesteps is not None:
+        config["n_timesteps"] = args.n_timesteps
+    training = TrainingRun(
+        args.algo,
+        args.env,
+        config,
+        args.output,
+        dataset=args.dataset[0] if args.dataset and len(args.dataset) == 1 else args.dataset,
+        examples=args.examples,
+        env_kwargs={"task": args.task} if args.task else {},
+        seed=args.seed,
+        eval_freq=args.eval_freq,
+        n_eval_episodes=args.eval_episodes,
+    )
+    train_run(training, verbose=1)
+    print(f"Saved {args.output / MODEL_FILE}")

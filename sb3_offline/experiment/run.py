@@ -1,0 +1,87 @@
+"""The description of one training run, and its record on the disk."""
+
+import json
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.experiment.data import given_data
+
+MODEL_FILE, CONFIG_FILE = "model.zip", "config.yml"
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """
+    What is trained, on which data, and where its files go.
+
+    The last three parameters change what is evaluated and saved on the way, but not what is learned, so :meth:`record` leaves
+    them out.
+
+    :param algo: name in :data:`sb3_offline.ALGOS`
+    :param env_id: environment to evaluate in
+    :param config: hyperparameters, as :func:`~sb3_offline.experiment.config.load_config` returns them
+    :param output: folder for the files of the run
+    :param dataset: dataset path(s) (default: those of the config)
+    :param examples: success examples, for the algorithms that learn from them (default: those of the config)
+    :param env_kwargs: keyword arguments of the environment, in addition to those of the config
+    :param seed: seed of the run
+    :param eval_freq: gradient steps between evaluations (0 or less: no evaluations)
+    :param n_eval_episodes: number of episodes in each evaluation
+    :param save_freq: gradient steps between two saves of everything that the run needs to continue (0: no saves)
+    """
+
+    algo: str
+    env_id: str
+    config: dict[str, Any]
+    output: Path
+    dataset: Any = None
+    examples: Any = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    eval_freq: int = 0
+    n_eval_episodes: int = 20
+    save_freq: int = 0
+
+    def record(self) -> dict[str, Any]:
+        """
+        Describe the run in JSON types. Two runs with the same record learn the same.
+
+        :return: the content of ``config.yml`` in the folder of the run
+        """
+        env_kwargs = {**self.config.get("env_kwargs", {}), **self.env_kwargs}
+        described = {"algo": self.algo, "env": self.env_id, **self.config, "env_kwargs": env_kwargs, "seed": self.seed}
+        described |= given_data(self.dataset, self.examples)
+        # Through JSON: paths and NumPy numbers become types that a YAML file can hold.
+        return json.loads(json.dumps(described, default=_identifier))
+
+    def is_recorded(self) -> bool:
+        """:return: True if the folder belongs to a run with the same record"""
+        return recorded_run(self.output) == self.record()
+
+    def is_finished(self) -> bool:
+        """:return: True if the folder holds the trained model of this run"""
+        return (self.output / MODEL_FILE).is_file() and self.is_recorded()
+
+
+def recorded_run(output: Path) -> dict[str, Any] | None:
+    """
+    :param output: folder of a run
+    :return: the content of its ``config.yml``, or ``None`` if there is no such file
+    """
+    config_file = output / CONFIG_FILE
+    return yaml.safe_load(config_file.read_text()) if config_file.is_file() else None
+
+
+def _identifier(value: Any) -> str:
+    """:return: a text that identifies a value, also in another process"""
+    if isinstance(value, OfflineDataset):
+        return f"{value.path}, {value.n_episodes} episodes, {zlib.crc32(value.actions.tobytes()):08x}"
+    if isinstance(value, np.ndarray):
+        return f"array {value.shape}, {value.dtype}, {zlib.crc32(value.tobytes()):08x}"
+    return f"{value.__module__}.{value.__qualname__}" if callable(value) and hasattr(value, "__qualname__") else str(value)
