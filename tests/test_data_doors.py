@@ -1,4 +1,4 @@
-"""Data of other libraries come in whole, and go out to Minari whole."""
+"""Data of other libraries are read without loss, and are written as Minari datasets without loss."""
 
 import pickle
 import shutil
@@ -29,7 +29,7 @@ ROLLOUTS = Path(__file__).parent / "files" / "imitation_rollouts"
 
 
 def assert_same(one: OfflineDataset, other: OfflineDataset):
-    """All arrays and attributes are equal, but for what Minari added to the provenance."""
+    """All arrays and attributes are equal, apart from what Minari adds to the provenance."""
     assert one.arrays.keys() == other.arrays.keys()
     for name, array in one.arrays.items():
         array, copy = np.asarray(array), np.asarray(other.arrays[name])
@@ -88,10 +88,10 @@ def test_a_dict_of_arrays(samples):
         (b"", "file: .* an empty file"),
         (b"<html>404</html>", "neither HDF5, nor a zip archive, nor a pickle, but begins with b'<html>404</html>'"),
         (b"PK\x03\x04 and no more", "an empty or damaged zip archive"),
-        (pickle.dumps([{"observations": np.zeros(3)}]), "a pickle of list"),
-        (pickle.dumps({"a": 1}, protocol=2), "a pickle of dict"),
-        (pickle.dumps(np.zeros(3)), r"a pickle of numpy\..*"),
-        (["a.npz", "b.npz"], r"folder: .* a folder with a\.npz, b\.npz"),
+        (pickle.dumps([{"observations": np.zeros(3)}]), "a pickle with an object of type list"),
+        (pickle.dumps({"a": 1}, protocol=2), "a pickle with an object of type dict"),
+        (pickle.dumps(np.zeros(3)), r"a pickle with an object of type numpy\..*"),
+        (["a.npz", "b.npz"], r"folder: .* a folder with a\.npz, b\.npz\. Give a file or a pattern"),
         ([], "an empty folder"),
         (42, "<int>: object: .* an object of type builtins.int"),
         ({"obs": 1}, "<dict>: object: .* an object of type builtins.dict with the keys obs"),
@@ -185,13 +185,13 @@ def test_to_minari_and_back(minari, tmp_path, space, options):
     assert_same(OfflineDataset(tmp_path / "d.h5"), OfflineDataset(tmp_path / "back.h5"))
     if not options:
         dataset = OfflineDataset(tmp_path / "d.h5")
-        dataset.header.env_id = "Pendulum-v1"  # as --env does where a source declares none
+        dataset.header.env_id = "Pendulum-v1"  # as --env does for data that declare none
         convert(dataset, "minari:test/named-v0")
         assert OfflineDataset("minari:test/named-v0").env_id == "Pendulum-v1"
 
 
 def test_from_minari_and_back(minari, tmp_path):
-    """What Minari's own functions wrote: float64 rewards and actions, nested infos with a row of the reset, texts, options."""
+    """A dataset that Minari wrote: float64 rewards and actions, nested infos with a row of the reset, texts, options."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     space, actions = spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float64)}), spaces.Box(-1, 1, (1,), np.float64)
@@ -282,7 +282,7 @@ def test_the_extra_that_is_missing_is_named(tmp_path, monkeypatch):
 
 
 class Walk(gym.Env):
-    """Terminates now and then; every observation is another one."""
+    """Terminates now and then; no two observations are equal."""
 
     action_space = ACTIONS
 
@@ -321,7 +321,7 @@ def collect(path, n_steps, as_dict=False, learn_twice=False, **kwargs):
 
 
 def transitions_of(buffer, steps):
-    """Of each (place, environment), sorted: end, observation, action, reward and next observation."""
+    """End, action, reward, observation and next observation at each (place, environment), sorted."""
     rows = []
     for place, env in steps:
         done = buffer.dones[place, env] * (1 - buffer.timeouts[place, env])
@@ -358,7 +358,7 @@ def test_every_transition_of_a_replay_buffer_is_there(tmp_path, as_dict, buffer_
 
 @pytest.mark.parametrize("buffer_size", [1000, 90])
 def test_a_buffer_of_half_the_memory(tmp_path, buffer_size):
-    """It overwrites the observations that episodes end with, and does not say which ends were time limits."""
+    """Such a buffer overwrites the last observations of episodes, and does not tell which ends were time limits."""
     kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
     buffer = collect(tmp_path / "b.pkl", 150, buffer_size=buffer_size, **kwargs)
     steps = [(p, e) for p in range(buffer.size()) for e in range(3) if not (buffer.full and p == buffer.pos)]
@@ -369,7 +369,7 @@ def test_a_buffer_of_half_the_memory(tmp_path, buffer_size):
     np.testing.assert_allclose(dataset_transitions(everything)[inside], wanted[inside], atol=1e-5)
     limited = OfflineDataset(tmp_path / "b.pkl", max_episode_steps=6)
     lengths = limited.lengths[limited.truncated[limited.step_starts + limited.lengths - 1]]
-    assert len(lengths) > 5 and set(lengths) <= {5, 6}  # the last step led nobody knows where, but for the newest
+    assert len(lengths) > 5 and set(lengths) <= {5, 6}  # most episodes lose their last step
     assert limited.n_steps == len(steps) - (lengths == 5).sum()
 
 
@@ -387,7 +387,7 @@ def test_replay_buffers_in_memory_and_of_old_versions(tmp_path):
     assert set(limited.lengths[limited.truncated[last]]) == {6}
 
 
-def test_what_is_no_replay_buffer_is_named(tmp_path):
+def test_pickles_without_a_replay_buffer_are_refused(tmp_path):
     whole = pickle.dumps(Fraction(1, 2))
     for name, content, message in (
         ("a.pkl", whole, "is a fractions.Fraction, not a ReplayBuffer"),

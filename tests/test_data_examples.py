@@ -41,7 +41,7 @@ def write_as(kind, folder):
 
 
 @pytest.mark.parametrize("kind", ["array", "npz", "single.npz", "npy", "channel-first.npy", "h5", "png"])
-def test_the_same_examples_from_every_source_in_both_layouts(tmp_path, kind):
+def test_all_kinds_of_files_give_the_same_examples_in_both_layouts(tmp_path, kind):
     source = write_as(kind, tmp_path)
     np.testing.assert_array_equal(load_examples(source, IMAGES), FRAMES)
     turned = load_examples(str(source) if kind != "array" else source, CHANNEL_FIRST)
@@ -50,7 +50,7 @@ def test_the_same_examples_from_every_source_in_both_layouts(tmp_path, kind):
 
 
 def test_photographs_are_turned_upright_and_resized(tmp_path):
-    # 60x80 pixels, left half red and right half blue, stored lying on its side as a telephone does
+    # 60x80, left half red and right half blue, stored on its side as telephones do
     picture = np.zeros((80, 60, 3), np.uint8)
     picture[:, :30, 0] = picture[:, 30:, 2] = 200
     exif = Image.Exif()
@@ -99,7 +99,7 @@ def test_unfit_arrays(tmp_path, source, message):
 @pytest.mark.parametrize(
     ("space", "row"), [(spaces.Discrete(3, start=1), 4), (spaces.MultiDiscrete([2, 3]), [2, 0]), (spaces.Discrete(3), -1)]
 )
-def test_choices_that_there_are_not(space, row):
+def test_invalid_choices(space, row):
     with pytest.raises(DatasetError, match=r"examples: holds .* in row 1, which is not in (Multi)?Discrete"):
         load_examples(np.array([space.sample(), row]), space)
 

@@ -56,9 +56,10 @@ class MappedFile:
     def _open(self, descriptor: int) -> mmap.mmap:
         self._map = mapped = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
         self._mapped[id(self)] = self
-        for key, file in list(self._mapped.items())[:-MAX_OPEN_MAPS]:
-            file._map = None
-            self._mapped.pop(key, None)
+        while len(self._mapped) > MAX_OPEN_MAPS:
+            oldest = next(iter(self._mapped.values()), self)
+            self._mapped.pop(id(oldest), None)
+            oldest._map = None
         return mapped
 
 

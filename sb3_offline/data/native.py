@@ -7,7 +7,7 @@ import h5py
 
 from sb3_offline.data.arrays import ArrayLike, HDF5Array, MappedArray, MappedFile
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.format import FORMAT, Field, Header, Storage, read_header
+from sb3_offline.data.format import FORMAT, Header, Storage, read_header
 
 # Observations and extras may be as large as the disk, so they are left there.
 LEFT_IN_THE_FILE = ("observations", "extras/")
@@ -45,43 +45,42 @@ def read_native(file: h5py.File, path: Path) -> Native:
     :raises DatasetError: if the file is of a newer version, or if an array is missing, too short, or of another kind
     """
     header = read_header(file, path)
-    n_episodes, n_steps = _count(file, header, path)
-    storage: Storage = "contiguous" if file["actions"].chunks is None else "compressed"
+    fields = header.fields()
+    found = {name: file.get(name) for name in ["n_episodes", *fields]}  # looked up once: HDF5 takes most of the time
+    for name, array in found.items():
+        if not isinstance(array, h5py.Dataset):
+            raise DatasetError(path, name, "is missing", "Write the file again with DatasetWriter")
+    n_episodes, n_steps = _count(found["n_episodes"], found["episodes/length"], path)
+    storage: Storage = "contiguous" if found["actions"].chunks is None else "compressed"
     # Map the very file that is open: a writer may have put a larger one at its path in the meantime.
     mapped = MappedFile(path, file.id.get_vfd_handle()) if storage == "contiguous" else None
     arrays: dict[str, ArrayLike] = {}
-    for name, spec in header.fields().items():
-        rows = spec.rows(n_episodes, n_steps)
-        _check_array(file[name], name, spec, path)
-        if len(file[name]) < rows:
-            problem = f"has {len(file[name])} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
+    for name, spec in fields.items():
+        array, rows = found[name], spec.rows(n_episodes, n_steps)
+        shape, dtype = array.shape, array.dtype
+        if dtype != spec.dtype or shape[1:] != spec.shape:
+            problem = f"holds rows of shape {shape[1:]} and dtype {dtype}, expected {spec.shape} {spec.dtype}"
+            raise DatasetError(path, name, problem, "Write the file again with DatasetWriter")
+        if shape[0] < rows:
+            problem = f"has {shape[0]} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
             raise DatasetError(path, name, problem, "Leave out incomplete episodes, or write the file again")
         if not name.startswith(LEFT_IN_THE_FILE) or rows * spec.row_bytes == 0:
-            arrays[name] = file[name][:rows]
-        elif mapped is not None and (offset := file[name].id.get_offset()) is not None:
+            arrays[name] = array[:rows]
+        elif mapped is not None and (offset := array.id.get_offset()) is not None:
             arrays[name] = MappedArray(mapped, offset, rows, spec)
         else:
             arrays[name] = HDF5Array(path, name, rows, spec)
     return Native(header, arrays, storage)
 
 
-def _count(file: h5py.File, header: Header, path: Path) -> tuple[int, int]:
+def _count(n_episodes: h5py.Dataset, lengths: h5py.Dataset, path: Path) -> tuple[int, int]:
     """:return: the numbers of episodes and steps that exist"""
-    for name in ["n_episodes", *header.fields()]:
-        if not isinstance(file.get(name), h5py.Dataset):
-            raise DatasetError(path, name, "is missing", "Write the file again with DatasetWriter")
-    n_episodes, room = int(file["n_episodes"][()]), len(file["episodes/length"])
-    if not 0 <= n_episodes <= room:
-        problem = f"is {n_episodes}, but episodes/length has {room} rows"
+    n, room = int(n_episodes[()]), len(lengths)
+    if not 0 <= n <= room:
+        problem = f"is {n}, but episodes/length has {room} rows"
         raise DatasetError(path, "n_episodes", problem, "The file is damaged: take a copy, or write it again")
-    lengths = file["episodes/length"][:n_episodes]
-    if n_episodes and lengths.min() < 1:
-        problem = f"holds an episode of {lengths.min()} steps"
+    existing = lengths[:n]
+    if n and existing.min() < 1:
+        problem = f"holds an episode of {existing.min()} steps"
         raise DatasetError(path, "episodes/length", problem, "Leave empty episodes out")
-    return n_episodes, int(lengths.sum())
-
-
-def _check_array(array: h5py.Dataset, name: str, spec: Field, path: Path) -> None:
-    if array.dtype != spec.dtype or array.shape[1:] != spec.shape:
-        problem = f"holds rows of shape {array.shape[1:]} and dtype {array.dtype}, expected {spec.shape} {spec.dtype}"
-        raise DatasetError(path, name, problem, "Write the file again with DatasetWriter")
+    return n, int(existing.sum())

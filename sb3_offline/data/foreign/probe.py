@@ -151,7 +151,7 @@ class Probe:
         if self.kind == "zip":
             return f"a zip archive (or .npz file) with {self._listed()}" if self.names else "an empty or damaged zip archive"
         if self.kind == "pickle":
-            return f"a pickle of {self.pickled or 'an unknown type'}"
+            return f"a pickle with an object of type {self.pickled}" if self.pickled else "a pickle of some other kind"
         if not self.head:
             return "an empty file"
         return f"neither HDF5, nor a zip archive, nor a pickle, but begins with {self.head[:20]!r}"

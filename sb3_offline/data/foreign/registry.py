@@ -81,7 +81,9 @@ def unknown_format(probe: Probe) -> DatasetError:
     formats = {"sb3-offline": f"an HDF5 file with the attribute format={NATIVE_FORMAT!r}"}
     formats |= {known.name: known.description for known in known_formats()}
     remedy = "The known formats are: " + "; ".join(f"{name} ({description})" for name, description in formats.items())
-    if promised := probe.promised_kind():
+    if probe.kind == "folder":
+        remedy = f"Give a file or a pattern of files (folder/*.h5), or a folder of a known format. {remedy}"
+    elif promised := probe.promised_kind():
         remedy = f"Check that the file is complete, since its name promises a {promised} file. {remedy}"
     field = probe.kind if probe.kind in ("object", "folder") else "file"
     return DatasetError(probe.path, field, f"has no known format: it is {probe.describe()}", remedy)
