@@ -9,16 +9,15 @@ ROOT = Path(__file__).parent.parent
 
 #: Rooms from the ground up. A room may import itself and any room below it. Algorithms share one floor.
 FLOORS = [
-    ["data"],
-    ["envs"],
+    ["data", "envs", "parallel"],
     ["common"],
     ["ALGORITHMS"],
     ["evaluation"],
-    ["data_tools"],
-    ["experiment"],
+    ["data_tools", "experiment"],
     ["benchmark"],
     ["report"],
     ["demo", "zoo"],
+    ["commands"],
     ["cli"],
 ]
 #: Algorithms that build on another one

@@ -1,9 +1,13 @@
-"""Data of other libraries come in whole, and go out to Minari whole."""
+"""Data of other libraries are read without loss, and are written as Minari datasets without loss."""
 
 import pickle
+import shutil
+import sys
+from fractions import Fraction
 from pathlib import Path
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 from data_files import ACTIONS, BOTH, OPTIONS, STATES, make_episode, write_dataset
@@ -16,14 +20,16 @@ from sb3_offline.cli import main
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data.foreign import registry
+from sb3_offline.data.foreign.probe import Probe
+from sb3_offline.data.reader import OfflineDataset, open_datasets
 from sb3_offline.data.writer import DatasetWriter
 
 ROLLOUTS = Path(__file__).parent / "files" / "imitation_rollouts"
 
 
 def assert_same(one: OfflineDataset, other: OfflineDataset):
-    """All arrays and attributes are equal, but for what Minari added to the provenance."""
+    """All arrays and attributes are equal, apart from what Minari adds to the provenance."""
     assert one.arrays.keys() == other.arrays.keys()
     for name, array in one.arrays.items():
         array, copy = np.asarray(array), np.asarray(other.arrays[name])
@@ -32,6 +38,117 @@ def assert_same(one: OfflineDataset, other: OfflineDataset):
     for name in ("observation_space", "action_space", "env_id", "env_kwargs", "sources"):
         assert getattr(one, name) == getattr(other, name), name
     assert one.provenance == {key: value for key, value in other.provenance.items() if key != "minari"}
+
+
+# ----------------------------------------------------------------- formats
+
+
+def d4rl_arrays():
+    return {
+        "observations": np.arange(5, dtype=np.float32)[:, None],
+        "actions": np.zeros((5, 1), np.float32),
+        "rewards": np.arange(5.0),
+        "terminals": np.arange(5) == 4,
+    }
+
+
+@pytest.fixture
+def samples(tmp_path):
+    """A path of each format, by the format's name."""
+    collect(tmp_path / "buffer.pkl", 10)
+    np.savez(tmp_path / "rollouts.npz", **rollouts(acts=np.zeros((5, 1), np.float32)))
+    with h5py.File(tmp_path / "d4rl.hdf5", "w") as file:
+        file.update(d4rl_arrays())
+    write_dataset(tmp_path / "native.h5", 2)
+    names = {"Stable-Baselines3": "buffer.pkl", "imitation": "rollouts.npz", "D4RL": "d4rl.hdf5", "native": "native.h5"}
+    return {format_name: tmp_path / name for format_name, name in names.items()}
+
+
+@pytest.mark.filterwarnings("ignore:.*timeouts. are missing")
+def test_formats_are_recognised_by_their_contents(samples, tmp_path):
+    for format_name, path in samples.items():
+        with Probe(path) as probe:
+            recognizing = [known.name for known in registry.known_formats() if known.recognizes(probe)]
+        assert recognizing == ([] if format_name == "native" else [format_name])
+        for name in ("no_suffix", "wrong.pkl", "wrong.h5"):
+            shutil.copy(path, tmp_path / name)
+            assert_same(OfflineDataset(path), OfflineDataset(tmp_path / name))
+
+
+def test_a_dict_of_arrays(samples):
+    (dataset,) = open_datasets(d4rl_arrays() | {"next_observations": np.arange(1, 6, dtype=np.float32)[:, None]})
+    assert dataset.lengths.tolist() == [5] and dataset.observations[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    with pytest.raises(DatasetError, match="<dict>: rewards: has 4 rows, but actions has 5"):
+        OfflineDataset(d4rl_arrays() | {"rewards": np.zeros(4)})
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "file: .* an empty file"),
+        (b"<html>404</html>", "neither HDF5, nor a zip archive, nor a pickle, but begins with b'<html>404</html>'"),
+        (b"PK\x03\x04 and no more", "an empty or damaged zip archive"),
+        (pickle.dumps([{"observations": np.zeros(3)}]), "a pickle with an object of type list"),
+        (pickle.dumps({"a": 1}, protocol=2), "a pickle with an object of type dict"),
+        (pickle.dumps(np.zeros(3)), r"a pickle with an object of type numpy\..*"),
+        (["a.npz", "b.npz"], r"folder: .* a folder with a\.npz, b\.npz\. Give a file or a pattern"),
+        ([], "an empty folder"),
+        (42, "<int>: object: .* an object of type builtins.int"),
+        ({"obs": 1}, "<dict>: object: .* an object of type builtins.dict with the keys obs"),
+    ],
+)
+def test_what_has_no_known_format_is_described(tmp_path, content, found):
+    given = tmp_path / "x.bin"
+    if isinstance(content, bytes):
+        given.write_bytes(content)
+    elif isinstance(content, list):
+        given.mkdir()
+        for name in content:
+            (given / name).touch()
+    else:
+        given = content
+    with pytest.raises(DatasetError, match=found) as caught:
+        open_datasets(given)
+    for name in ("sb3-offline", "D4RL", "imitation", "Minari", "Stable-Baselines3"):
+        assert f"{name} (" in caught.value.remedy
+
+
+TOY_FORMAT = """
+import numpy as np
+from gymnasium import spaces
+from sb3_offline.data.foreign.base import Foreign, Format
+from sb3_offline.data.foreign.d4rl import read as read_d4rl
+
+def recognizes(probe):
+    return "qpos" in probe.names
+
+def read(probe, options):
+    header, arrays = read_d4rl(probe, options)
+    header.provenance = {"format": "toy", "limit": options.max_episode_steps}
+    return Foreign(header, arrays)
+
+FORMAT = Format("toy", "an HDF5 file with qpos", recognizes, read, declares_spaces=False, refines=REFINES)
+"""
+
+
+@pytest.mark.filterwarnings("ignore:.*timeouts. are missing")
+def test_a_format_is_added_by_one_module(samples, tmp_path, monkeypatch):
+    (tmp_path / "formats").mkdir()
+    with h5py.File(samples["D4RL"], "r+") as file:
+        file["qpos"] = np.zeros((5, 2))
+    monkeypatch.setattr(registry.folder, "__path__", [*registry.folder.__path__, str(tmp_path / "formats")])
+    try:
+        for module, refines in (("toy_one", "()"), ("toy_two", "('D4RL',)")):
+            (tmp_path / "formats" / f"{module}.py").write_text(TOY_FORMAT.replace("REFINES", refines))
+            registry.known_formats.cache_clear()
+            if refines == "()":
+                with pytest.raises(DatasetError, match="format: may have any of the formats D4RL, toy"):
+                    OfflineDataset(samples["D4RL"])
+                (tmp_path / "formats" / f"{module}.py").unlink()
+        dataset = OfflineDataset(samples["D4RL"], max_episode_steps=5)
+        assert dataset.provenance == {"format": "toy", "limit": 5} and dataset.guessed_actions
+    finally:
+        registry.known_formats.cache_clear()
 
 
 # ------------------------------------------------------------------ Minari
@@ -68,13 +185,13 @@ def test_to_minari_and_back(minari, tmp_path, space, options):
     assert_same(OfflineDataset(tmp_path / "d.h5"), OfflineDataset(tmp_path / "back.h5"))
     if not options:
         dataset = OfflineDataset(tmp_path / "d.h5")
-        dataset.header.env_id = "Pendulum-v1"  # as --env does where a source declares none
+        dataset.header.env_id = "Pendulum-v1"  # as --env does for data that declare none
         convert(dataset, "minari:test/named-v0")
         assert OfflineDataset("minari:test/named-v0").env_id == "Pendulum-v1"
 
 
 def test_from_minari_and_back(minari, tmp_path):
-    """What Minari's own functions wrote: float64 rewards and actions, nested infos with a row of the reset, texts, options."""
+    """A dataset that Minari wrote: float64 rewards and actions, nested infos with a row of the reset, texts, options."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     space, actions = spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float64)}), spaces.Box(-1, 1, (1,), np.float64)
@@ -136,24 +253,36 @@ def test_from_minari_and_back(minari, tmp_path):
     assert changed - {"dataset_size"} == {"dataset_id", "jpeg_encoding"}
 
 
-def test_minari_mistakes_are_named(minari, tmp_path, capsys):
-    with pytest.raises(DatasetError, match=r"minari:nothing: name: is no id"):
+def test_minari_mistakes_are_named(minari, tmp_path):
+    with pytest.raises(DatasetError, match=r"minari:nothing: name: is no ID"):
         OfflineDataset("minari:nothing")
-    with pytest.raises(DatasetError, match="file: does not exist"):
-        OfflineDataset("minari:nothing/there-v0")
+    with pytest.raises(DatasetError, match=r"dataset: does not exist\. .*: minari download mujoco/hopper/medium-v0"):
+        OfflineDataset("minari:mujoco/hopper/medium-v0")
+    with pytest.raises(
+        DatasetError, match=r"file: does not exist.* give minari:mujoco/hopper/medium-v0 for a dataset of Minari"
+    ):
+        open_datasets("mujoco/hopper/medium-v0")
     write_dataset(tmp_path / "d.h5", 2, STATES)
     main(["convert", str(tmp_path / "d.h5"), "minari:there-v0"])
     with pytest.raises(SystemExit, match=r"exists already\. Give another name or version"):
         main(["convert", str(tmp_path / "d.h5"), "minari:there-v0"])
-    with pytest.raises(DatasetError, match="is neither a Minari dataset nor"):
-        OfflineDataset(tmp_path)
+    there = tmp_path / "minari" / "there-v0"
+    for inside in (there, there / "data", there / "data" / "main_data.hdf5"):
+        assert_same(OfflineDataset(tmp_path / "d.h5"), OfflineDataset(inside))
+
+
+def test_the_extra_that_is_missing_is_named(tmp_path, monkeypatch):
+    write_dataset(tmp_path / "d.h5", 1)
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(DatasetError, match=r'Minari needs the package minari\. Install it with: .*"sb3-offline\[minari\]"'):
+        convert(tmp_path / "d.h5", "minari:test/there-v0")
 
 
 # ---------------------------------------------------------- replay buffers
 
 
 class Walk(gym.Env):
-    """Terminates now and then; every observation is another one."""
+    """Terminates now and then; no two observations are equal."""
 
     action_space = ACTIONS
 
@@ -192,7 +321,7 @@ def collect(path, n_steps, as_dict=False, learn_twice=False, **kwargs):
 
 
 def transitions_of(buffer, steps):
-    """Of each (place, environment), sorted: end, observation, action, reward and next observation."""
+    """End, action, reward, observation and next observation at each (place, environment), sorted."""
     rows = []
     for place, env in steps:
         done = buffer.dones[place, env] * (1 - buffer.timeouts[place, env])
@@ -229,7 +358,7 @@ def test_every_transition_of_a_replay_buffer_is_there(tmp_path, as_dict, buffer_
 
 @pytest.mark.parametrize("buffer_size", [1000, 90])
 def test_a_buffer_of_half_the_memory(tmp_path, buffer_size):
-    """It overwrites the observations that episodes end with, and does not say which ends were time limits."""
+    """Such a buffer overwrites the last observations of episodes, and does not tell which ends were time limits."""
     kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
     buffer = collect(tmp_path / "b.pkl", 150, buffer_size=buffer_size, **kwargs)
     steps = [(p, e) for p in range(buffer.size()) for e in range(3) if not (buffer.full and p == buffer.pos)]
@@ -240,14 +369,29 @@ def test_a_buffer_of_half_the_memory(tmp_path, buffer_size):
     np.testing.assert_allclose(dataset_transitions(everything)[inside], wanted[inside], atol=1e-5)
     limited = OfflineDataset(tmp_path / "b.pkl", max_episode_steps=6)
     lengths = limited.lengths[limited.truncated[limited.step_starts + limited.lengths - 1]]
-    assert len(lengths) > 5 and set(lengths) <= {5, 6}  # the last step led nobody knows where, but for the newest
+    assert len(lengths) > 5 and set(lengths) <= {5, 6}  # most episodes lose their last step
     assert limited.n_steps == len(steps) - (lengths == 5).sum()
 
 
-def test_what_is_no_replay_buffer_is_named(tmp_path):
+def test_replay_buffers_in_memory_and_of_old_versions(tmp_path):
+    buffer = collect(tmp_path / "b.pkl", 150)
+    saved, (alive,) = OfflineDataset(tmp_path / "b.pkl"), open_datasets(buffer)
+    assert_same(saved, alive)
+    assert_same(saved.select([2, 0]), pickle.loads(pickle.dumps(alive)).select([2, 0]))
+    del buffer.timeouts, buffer.handle_timeout_termination
+    old = OfflineDataset(buffer)
+    assert old.n_steps == saved.n_steps and not old.truncated.any()
+    limited = OfflineDataset(buffer, max_episode_steps=6)
+    last = limited.step_starts + limited.lengths - 1
+    assert saved.truncated.any() and limited.truncated[saved.truncated].all()
+    assert set(limited.lengths[limited.truncated[last]]) == {6}
+
+
+def test_pickles_without_a_replay_buffer_are_refused(tmp_path):
+    whole = pickle.dumps(Fraction(1, 2))
     for name, content, message in (
-        ("a.pkl", b"not a pickle", "cannot be unpickled"),
-        ("b.pkl", pickle.dumps({"a": 1}), r"holds a builtins.dict, no ReplayBuffer"),
+        ("a.pkl", whole, "is a fractions.Fraction, not a ReplayBuffer"),
+        ("b.pkl", whole[:-10], "file: cannot be unpickled"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DatasetError, match=message):
@@ -301,7 +445,7 @@ def test_rollouts_in_a_folder_say_which_episodes_were_cut():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({}, r"actions: reaches from .* declares no bounds. Open it with OfflineDataset\(path, action_space="),
+        ({}, r"actions: reaches from .* declare no bounds. Open it with OfflineDataset\(path, action_space="),
         ({"acts": np.zeros(5, np.int64)}, "actions: has dtype int64"),
         ({"obs": np.zeros((6, 2), np.float32)}, "obs: has 6 rows, expected 7 for 5 actions in 2 episodes"),
         ({"indices": np.array([5])}, "indices: holds an episode without a step"),
@@ -312,7 +456,7 @@ def test_bad_rollouts(tmp_path, changes, message):
     with pytest.raises(DatasetError, match=message):
         OfflineDataset(tmp_path / "r.npz")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    with pytest.raises(DatasetError, match="obs: is missing"):
+    with pytest.raises(DatasetError, match=r"no known format: it is a zip archive .* with x.*obs, acts, terminal, indices"):
         OfflineDataset(tmp_path / "other.npz")
 
 

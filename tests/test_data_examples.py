@@ -41,7 +41,7 @@ def write_as(kind, folder):
 
 
 @pytest.mark.parametrize("kind", ["array", "npz", "single.npz", "npy", "channel-first.npy", "h5", "png"])
-def test_the_same_examples_from_every_source_in_both_layouts(tmp_path, kind):
+def test_all_kinds_of_files_give_the_same_examples_in_both_layouts(tmp_path, kind):
     source = write_as(kind, tmp_path)
     np.testing.assert_array_equal(load_examples(source, IMAGES), FRAMES)
     turned = load_examples(str(source) if kind != "array" else source, CHANNEL_FIRST)
@@ -50,7 +50,7 @@ def test_the_same_examples_from_every_source_in_both_layouts(tmp_path, kind):
 
 
 def test_photographs_are_turned_upright_and_resized(tmp_path):
-    # 60x80 pixels, left half red and right half blue, stored lying on its side as a telephone does
+    # 60x80, left half red and right half blue, stored on its side as telephones do
     picture = np.zeros((80, 60, 3), np.uint8)
     picture[:, :30, 0] = picture[:, 30:, 2] = 200
     exif = Image.Exif()
@@ -73,7 +73,7 @@ def test_dict_and_state_examples(tmp_path):
         np.testing.assert_array_equal(loaded["image"], examples["image"].transpose(0, 3, 1, 2))
         np.testing.assert_array_equal(loaded["state"], examples["state"])
     assert load_examples(examples["state"].astype(np.float64), STATES).dtype == np.float32
-    with pytest.raises(DatasetError, match="examples/state: holds 3 examples, other keys 4"):
+    with pytest.raises(DatasetError, match="examples/state: holds 3 examples, but other keys hold 4"):
         load_examples({**examples, "state": examples["state"][:3]}, learner)
     with pytest.raises(DatasetError, match=r"is not a dict with the keys \['image', 'state'\]"):
         load_examples(examples["image"], learner)
@@ -84,7 +84,7 @@ def test_dict_and_state_examples(tmp_path):
     [
         (FRAMES[:0], "holds no example"),
         (FRAMES / 255, "has dtype float64, expected uint8.*255"),
-        (FRAMES // 255, "holds only the pixel values 0 and 1. Multiply"),
+        (FRAMES // 255, "holds only the values 0 and 1. Multiply"),
         (FRAMES[:, :4], r"has shape \(5, 4, 6, 3\), expected \(n, 8, 6, 3\)"),
         (FRAMES[0], r"has shape \(8, 6, 3\), expected"),
         (FRAMES.astype(np.int64) + 200, "holds values in .* outside of the range"),
@@ -99,7 +99,7 @@ def test_unfit_arrays(tmp_path, source, message):
 @pytest.mark.parametrize(
     ("space", "row"), [(spaces.Discrete(3, start=1), 4), (spaces.MultiDiscrete([2, 3]), [2, 0]), (spaces.Discrete(3), -1)]
 )
-def test_choices_that_there_are_not(space, row):
+def test_invalid_choices(space, row):
     with pytest.raises(DatasetError, match=r"examples: holds .* in row 1, which is not in (Multi)?Discrete"):
         load_examples(np.array([space.sample(), row]), space)
 
@@ -112,7 +112,7 @@ def test_unfit_files(tmp_path):
 
     fails(tmp_path / "none.npz", "file: does not exist")
     fails(tmp_path, "holds no .png")
-    fails(tmp_path, "holds pictures, but the observation space is Box.*float32", STATES)
+    fails(tmp_path, "holds images, but the observation space is Box.*float32", STATES)
     (tmp_path / "a.npz").write_bytes(b"zip?")
     fails(tmp_path / "a.npz", "cannot be read")
     np.savez(tmp_path / "b.npz", a=FRAMES, b=FRAMES)
@@ -125,10 +125,10 @@ def test_unfit_files(tmp_path):
     write_dataset(tmp_path / "d.h5")
     fails(tmp_path / "d.h5", "is 'sb3-offline-dataset' version 1, expected 'sb3-offline-examples'.*Extract")
     (tmp_path / "x.png").write_bytes(b"PNG?")
-    with pytest.raises(DatasetError, match=r"x.png: picture: cannot be read"):
+    with pytest.raises(DatasetError, match=r"x.png: image: cannot be read"):
         load_examples(tmp_path, IMAGES)
     Image.fromarray(np.full((8, 6), 40_000, np.uint16)).save(tmp_path / "x.png")
-    with pytest.raises(DatasetError, match=r"x.png: picture: has pixels of Pillow's mode I;16.*8 bits"):
+    with pytest.raises(DatasetError, match=r"x.png: image: has Pillow's mode I;16.*8 bits"):
         load_examples(tmp_path, IMAGES)
 
 

@@ -4,11 +4,13 @@ import pickle
 import h5py
 import numpy as np
 import pytest
-from data_files import ACTIONS, IMAGES, STATES, write_dataset
+from data_files import ACTIONS, BOTH, IMAGES, STATES, make_episode, write_dataset
 from gymnasium import spaces
 
+from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.convert import convert
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.examples import load_examples, save_examples
 from sb3_offline.data.reader import OfflineDataset, open_datasets
 
 
@@ -58,8 +60,11 @@ def test_lengths_and_starts(tmp_path):
     [
         (lambda path: path.unlink(), "file: does not exist"),
         (cut_file, "file: is truncated. Copy or download it again"),
-        (scribble, "file: cannot be read as HDF5"),
-        (edit(lambda f: f.attrs.__setitem__("format", "minari")), "attribute format: is 'minari', expected"),
+        (
+            scribble,
+            "file: has no known format: it is neither HDF5, .* begins with b'not a dataset'. .* its name promises a HDF5 file",
+        ),
+        (edit(lambda f: f.attrs.__setitem__("format", "minari")), "has no known format: it is an HDF5 file .*format='minari'"),
         (edit(lambda f: f.attrs.__setitem__("format_version", 2)), "format_version: is 2, this release reads 1. Update"),
         (edit(lambda f: f.attrs.__delitem__("action_space")), "attribute action_space: is missing"),
         (edit(lambda f: f.attrs.__setitem__("action_space", "Box(2,)")), "attribute action_space: cannot be understood"),
@@ -101,7 +106,7 @@ def test_file_that_its_user_has_open_too(tmp_path, locking):
 @pytest.mark.parametrize("storage", ["contiguous", "compressed"])
 @pytest.mark.parametrize("state", [STATES, spaces.Box(-1, 1, (4, 3)), spaces.Box(-9, 9, (3, 4, 1))])
 def test_nan_in_states_is_found(tmp_path, monkeypatch, storage, state):
-    monkeypatch.setattr("sb3_offline.data.reader.CHECK_BYTES", 100)  # several pieces
+    monkeypatch.setattr("sb3_offline.data.checks.CHECK_BYTES", 100)  # several pieces
     write_dataset(tmp_path / "whole.h5", space=spaces.Dict({"image": IMAGES, "state": state}))
     convert(tmp_path / "whole.h5", tmp_path / "d.h5", storage, progress_bar=False)
     assert OfflineDataset(tmp_path / "d.h5").storage == storage
@@ -133,6 +138,52 @@ def test_files_that_do_not_belong_together(tmp_path):
     edit(lambda file: file.__delitem__("rewards"))(tmp_path / "c.h5")
     with pytest.raises(DatasetError, match=r"c.h5: rewards: are missing, but .*a.h5 has them"):
         open_datasets([tmp_path / "a.h5", tmp_path / "c.h5"])
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs a list of open files")
+@pytest.mark.parametrize("storage", ["mmap", "memory"])
+def test_more_files_than_may_be_open(tmp_path, monkeypatch, storage):
+    monkeypatch.setattr("sb3_offline.data.arrays.MAX_OPEN_MAPS", 3)
+    for index in range(20):
+        write_dataset(tmp_path / f"{index:02d}.h5", 1, BOTH, first=index)
+    episodes = [make_episode(index, BOTH) for index in range(20)]
+    n_open = len(os.listdir("/proc/self/fd"))
+    buffer = OfflineReplayBuffer(str(tmp_path / "*.h5"), BOTH, ACTIONS, "cpu", storage=storage)
+    for _ in range(2):
+        batch = buffer.transitions(np.arange(buffer.size()))
+        for key, values in batch.observations.items():
+            wanted = np.concatenate([episode["observations"][key][:-1] for episode in episodes])
+            np.testing.assert_array_equal(values, wanted)
+    assert len(os.listdir("/proc/self/fd")) <= n_open + 3
+    views = [dataset.observations["state"] for dataset in buffer.datasets]  # maps stay open while there are views of them
+    for view, episode in zip(views, episodes, strict=True):
+        np.testing.assert_array_equal(view, episode["observations"]["state"])
+    del views, view, buffer
+    assert len(os.listdir("/proc/self/fd")) == n_open
+
+
+def test_a_file_that_was_replaced_is_not_read_as_the_one_that_was_opened(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_offline.data.arrays.MAX_OPEN_MAPS", 1)
+    for name in ("a", "b"):
+        write_dataset(tmp_path / f"{name}.h5", 3)
+    first, second = open_datasets([tmp_path / "a.h5", tmp_path / "b.h5"])
+    before = np.array(second.observations)
+    write_dataset(tmp_path / "b.h5", 3, first=5, mode="w")
+    np.testing.assert_array_equal(second.observations, before)  # still open
+    assert len(first.observations) == len(before)
+    with pytest.raises(DatasetError, match=r"b\.h5: file: was replaced or removed after the dataset was opened"):
+        second.arrays["observations"][0]
+    assert OfflineDataset(tmp_path / "b.h5").seeds.tolist() == [5, 6, 7]
+
+
+def test_paths_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    write_dataset("~/a.h5", 3)
+    convert("~/a.h5", "~/b.h5", progress_bar=False)
+    save_examples("~/e.h5", OfflineDataset("~/b.h5").observations[:2], IMAGES)
+    assert len(load_examples("~/e.h5", IMAGES)) == 2 and len(open_datasets("~/[ab].h5")) == 2
+    assert sorted(os.listdir(tmp_path)) == ["a.h5", "b.h5", "e.h5"]
 
 
 def d4rl_arrays(n=10):
@@ -170,7 +221,7 @@ def test_d4rl_file_with_next_observations(tmp_path):
 def test_d4rl_file_without_next_observations(tmp_path):
     write_arrays(tmp_path / "d.hdf5", d4rl_arrays())
     dataset = OfflineDataset(tmp_path / "d.hdf5")
-    # The observations after steps 7 and 9 are unknown: these steps are left out; that after step 3 repeats the last one
+    # The observations after steps 7 and 9 are unknown, so these steps are left out. Step 3 terminates and repeats its own.
     assert dataset.lengths.tolist() == [4, 3, 1]
     assert dataset.observations[:, 0].tolist() == [0, 1, 2, 3, 3, 4, 5, 6, 7, 8, 9]
     assert dataset.rewards.tolist() == [0, 1, 2, 3, 4, 5, 6, 8]

@@ -1,4 +1,4 @@
-"""Episodes chosen by their labels: in the data layer, in a config, and for a learner."""
+"""Selection of episodes by their labels: in datasets, in a config, and for a learner."""
 
 import pickle
 
@@ -20,7 +20,7 @@ def solved(episode):
 
 
 @pytest.mark.parametrize("storage", ["contiguous", "compressed"])
-def test_chosen_episodes_are_the_files_own(storage, tmp_path):
+def test_selected_episodes_are_those_of_the_file(storage, tmp_path):
     episodes = write_dataset(tmp_path / "raw.h5", 40, BOTH)
     convert(tmp_path / "raw.h5", tmp_path / "d.h5", storage)
     (dataset,) = select_episodes(tmp_path / "d.h5", source="left", success=True)
@@ -44,7 +44,7 @@ def test_failures_of_one_source_are_failures_of_that_source(tmp_path):
     assert len(wanted) > 0 and dataset.seeds.tolist() == wanted
 
 
-def test_files_without_a_wanted_episode_are_left_out(tmp_path):
+def test_files_without_selected_episodes_are_left_out(tmp_path):
     for first in (0, 1):
         write_dataset(tmp_path / f"{first}.h5", 1, first=first)  # "right", "left"
     (only,) = select_episodes(str(tmp_path / "*.h5"), source="left")
@@ -53,7 +53,7 @@ def test_files_without_a_wanted_episode_are_left_out(tmp_path):
     assert [part.path.name for part in select_episodes(str(tmp_path / "*.h5"), source="right")] == ["0.h5", "2.h5"]
 
 
-def test_what_cannot_be_chosen_is_named(tmp_path):
+def test_impossible_selections_are_named(tmp_path):
     write_dataset(tmp_path / "d.h5", 3)
     with DatasetWriter(tmp_path / "unlabelled.h5", STATES, ACTIONS, rewards=False, success=False) as writer:
         writer.add_episode(np.zeros((3, 3)), np.zeros((2, 2)))
@@ -71,7 +71,7 @@ def test_what_cannot_be_chosen_is_named(tmp_path):
         create_model("bc", {**config, "episodes": {"rewards": 1}}, str(tmp_path / "d.h5"))
 
 
-def test_masks_choose_episodes(tmp_path):
+def test_masks_select_episodes(tmp_path):
     write_dataset(tmp_path / "d.h5", 4)
     dataset = OfflineDataset(tmp_path / "d.h5")
     chosen = dataset.select(np.array([False, True, False, True]))
@@ -81,7 +81,7 @@ def test_masks_choose_episodes(tmp_path):
             dataset.select(wrong)
 
 
-def test_a_config_chooses_what_is_learned_from(tmp_path):
+def test_a_config_selects_the_episodes_to_learn_from(tmp_path):
     episodes = write_dataset(tmp_path / "d.h5", space=STATES)
     config = {
         "policy": "MlpPolicy",
@@ -96,4 +96,4 @@ def test_a_config_chooses_what_is_learned_from(tmp_path):
     np.testing.assert_allclose(model.replay_buffer.actions, (np.concatenate(wanted) - middle) / half, atol=1e-6)
     model.save(tmp_path / "model")
     (tmp_path / "d.h5").unlink()
-    assert BC.load(tmp_path / "model").dataset is None  # predicts where the data are no more
+    assert BC.load(tmp_path / "model").dataset is None  # a model predicts without its data

@@ -177,7 +177,7 @@ def test_reading_while_the_file_is_replaced(tmp_path, monkeypatch):
             writer.add_episode(**make_episode(1))  # outgrows the room: another file, with other offsets
             return read_header(file, path)
 
-        monkeypatch.setattr("sb3_offline.data.reader.read_header", read_slowly)
+        monkeypatch.setattr("sb3_offline.data.native.read_header", read_slowly)
         assert_holds(OfflineDataset(tmp_path / "d.h5"), [make_episode(0)])
 
 
@@ -213,8 +213,8 @@ def test_one_writer_many_readers(tmp_path):
         ({"terminated": []}, r"terminated: has shape \(0,\), expected \(5,\)"),
         ({"observations": [[1], [2, 3]]}, r"observations: is no array \(.*\). Give rows of one shape"),
         ({"actions": [[1], [2, 3]]}, "actions: is no array"),
-        ({"seed": 2**63}, "seed: is 9223372036854775808, no integer of 64 bits"),
-        ({"seed": None}, "seed: is None, no integer"),
+        ({"seed": 2**63}, "seed: is 9223372036854775808, not an integer of 64 bits"),
+        ({"seed": None}, "seed: is None, not an integer"),
     ],
 )
 def test_a_bad_episode_is_refused_whole(tmp_path, change, message):

@@ -4,7 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets, JoinedRows
+from sb3_offline.data.storage import RowStore
+from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
 
 SAMPLED_IMAGES = 256
 READ_BYTES = 1 << 25
@@ -19,7 +20,7 @@ class ArrayStatistics(NamedTuple):
     :param images: (n, values) the sampled images, flattened; ``None`` if the array holds no images
     """
 
-    array: JoinedRows
+    array: RowStore
     low: np.ndarray
     high: np.ndarray
     n_bad: int
@@ -39,7 +40,7 @@ def array_statistics(data: JoinedDatasets) -> dict[str, ArrayStatistics]:
     return {name: _of_images(array) if len(array.shape) == 4 else _of_rows(array) for name, array in data.arrays.items()}
 
 
-def _of_images(array: JoinedRows) -> ArrayStatistics:
+def _of_images(array: RowStore) -> ArrayStatistics:
     rows = np.unique(np.linspace(0, len(array) - 1, SAMPLED_IMAGES).astype(int)) if len(array) else np.zeros(0, int)
     images = array[rows].reshape(len(rows), int(np.prod(array.shape[1:])))
     finite = np.isfinite(images).all(axis=1)
@@ -48,7 +49,7 @@ def _of_images(array: JoinedRows) -> ArrayStatistics:
     return ArrayStatistics(array, np.array([low]), np.array([high]), int((~finite).sum()), images)
 
 
-def _of_rows(array: JoinedRows) -> ArrayStatistics:
+def _of_rows(array: RowStore) -> ArrayStatistics:
     columns = int(np.prod(array.shape[1:]))
     if array.dtype.kind not in "biuf":  # text
         return ArrayStatistics(array, np.full(1, np.inf), np.full(1, -np.inf), 0)

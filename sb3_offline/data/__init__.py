@@ -1,1 +1,1 @@
-"""Datasets on disk, the buffer that learns from them, and success examples. This room knows no algorithm."""
+"""Datasets on disk, the replay buffer over them, and success examples. This package knows no algorithm."""

@@ -1,4 +1,4 @@
-"""Datasets from one form to another: contiguous (for training), compressed (for keeping and sending), and other libraries'."""
+"""Conversion of datasets: to contiguous storage (for training), to compressed storage (for keeping and sending), to Minari."""
 
 import os
 from pathlib import Path
@@ -8,15 +8,15 @@ from tqdm.auto import tqdm
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
+from sb3_offline.data.foreign.registry import format_of_name, write_foreign
 from sb3_offline.data.format import CHUNK_BYTES, Storage, create_file
-from sb3_offline.data.minari import PREFIX, write_minari
 from sb3_offline.data.reader import OfflineDataset
 
 PIECE_BYTES = 1 << 25
 
 
 def convert(
-    source: str | os.PathLike | OfflineDataset,
+    dataset: str | os.PathLike | OfflineDataset,
     destination: str | os.PathLike,
     storage: Storage = "contiguous",
     *,
@@ -24,33 +24,33 @@ def convert(
     progress_bar: bool = True,
 ) -> None:
     """
-    Copy a dataset to another form; every value and attribute stays the same. The destination appears whole or not at
-    all.
+    Copy a dataset to another storage or format. All values and attributes stay the same. The destination is written completely
+    or not at all.
 
-    :param source: whatever :class:`~sb3_offline.data.reader.OfflineDataset` opens
-    :param destination: file to write, which may be the source itself with ``overwrite``; or ``minari:namespace/name-v0``, a
-        new Minari dataset
-    :param storage: "contiguous" or "compressed" (gzip), of a file
+    :param dataset: anything that :class:`~sb3_offline.data.reader.OfflineDataset` opens
+    :param destination: file to write, which may be that of the dataset if ``overwrite`` is true; or a name such as
+        "minari:namespace/name-v0" for a new Minari dataset
+    :param storage: "contiguous" or "compressed" (gzip), for a file
     :param overwrite: replace an existing file
-    :param progress_bar: show progress
+    :param progress_bar: show the progress
+    :raises DatasetError: if the dataset cannot be opened, or if the destination exists and ``overwrite`` is false
     """
-    dataset = source if isinstance(source, OfflineDataset) else OfflineDataset(source)
-    if os.fspath(destination).startswith(PREFIX):
-        write_minari(dataset, os.fspath(destination))
+    opened = dataset if isinstance(dataset, OfflineDataset) else OfflineDataset(dataset)
+    foreign = format_of_name(os.fspath(destination))
+    if foreign is not None:
+        write_foreign(foreign, opened.header, opened.arrays, os.fspath(destination))
         return
-    path = Path(destination)
+    path = Path(destination).expanduser()
     if path.exists() and not overwrite:
         raise DatasetError(path, "file", "exists already", "Give another name, or overwrite it (--overwrite)")
-    fields = dataset.header.fields()
-    total = sum(spec.rows(dataset.n_episodes, dataset.n_steps) * spec.row_bytes for spec in fields.values())
+    fields = opened.header.fields()
+    total = sum(spec.rows(opened.n_episodes, opened.n_steps) * spec.row_bytes for spec in fields.values())
     with replacing(path) as temporary, tqdm(total=total, unit="B", unit_scale=True, disable=not progress_bar) as bar:
-        bar.set_description(f"{dataset.path.name} -> {storage}")
-        create_file(
-            temporary, dataset.header, dataset.n_episodes, dataset.n_steps, committed=dataset.n_episodes, storage=storage
-        )
+        bar.set_description(f"{opened.path.name} -> {storage}")
+        create_file(temporary, opened.header, opened.n_episodes, opened.n_steps, committed=opened.n_episodes, storage=storage)
         with h5py.File(temporary, "r+", locking=False) as file:
             for name, spec in fields.items():
-                array = dataset.arrays[name]
+                array = opened.arrays[name]
                 # Whole chunks at a time, so that none is compressed twice
                 chunk = max(CHUNK_BYTES // max(spec.row_bytes, 1), 1)
                 rows = max(PIECE_BYTES // max(spec.row_bytes, 1) // chunk, 1) * chunk

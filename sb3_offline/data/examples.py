@@ -1,4 +1,4 @@
-"""Success examples: observations of a solved task, from whatever file or folder a user has them in."""
+"""Success examples, the observations of a solved task: read from files, folders and arrays, and written to files."""
 
 import json
 import os
@@ -17,32 +17,33 @@ from sb3_offline.data.spaces import check_observations, space_to_json, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
 EXAMPLES_VERSION = 1
-PICTURES = (".png", ".jpg", ".jpeg")
-# Modes of Pillow with 8 bits a channel; it would clip others (16-bit PNGs) to white
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+# Pillow's modes with 8 bits per channel. It would clip images of other modes (16-bit PNGs) to white
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
 
 def load_examples(
-    source: str | os.PathLike | np.ndarray | Mapping[str, np.ndarray], observation_space: spaces.Space
+    examples: str | os.PathLike | np.ndarray | Mapping[str, np.ndarray], observation_space: spaces.Space
 ) -> Observations:
     """
-    Read success examples, in any form, as observations of a space.
+    Read success examples as observations of a space.
 
-    :param source: a file of ``save_examples``; an ``.npz`` (``observations``, or its only array; for a Dict space an array for
-        each key); a ``.npy``; an array, or a dict of arrays; or a folder of PNG or JPEG pictures, taken in the order of their
-        names and resized (the whole picture, so crop it before where its proportions differ)
-    :param observation_space: a Box, or a Dict; images may be channel-last or channel-first, here and in the source
-    :return: ``(n, *shape)`` of the space's dtype, or a dict of such; raises ``DatasetError`` where there is none, or where
-        shape, dtype or range do not fit the space
+    :param examples: an array or a dict of arrays, or the path of one of these: a file of ``save_examples``; an ``.npz``
+        file with ``observations`` or a single array (for a Dict space, with an array for each key); a ``.npy`` file; a folder
+        of PNG or JPEG images. Images are taken in the order of their names, and each is resized as a whole: crop images of
+        other proportions first
+    :param observation_space: a Box or a Dict. Images may be channel-last or channel-first, both here and in the examples
+    :return: ``(n, *shape)`` of the space's dtype, or a dict of such arrays
+    :raises DatasetError: if there is no example, or if shape, dtype or range do not fit the space
     """
-    value: Any = source
+    value: Any = examples
     file: str | os.PathLike = ""
-    if isinstance(source, str | os.PathLike):
-        file = path = Path(source).expanduser()
+    if isinstance(examples, str | os.PathLike):
+        file = path = Path(examples).expanduser()
         if path.is_dir():
-            value = _read_pictures(path, observation_space)
+            value = _read_images(path, observation_space)
         elif path.suffix in (".npz", ".npy"):
             value = _read_numpy(path, observation_space)
         else:
@@ -59,12 +60,13 @@ def load_examples(
     n = len(next(iter(arrays.values())))
     for name, array in arrays.items():
         if len(array) != n:
-            raise DatasetError(file, name, f"holds {len(array)} examples, other keys {n}", "Give equally many for each key")
+            problem = f"holds {len(array)} examples, but other keys hold {n}"
+            raise DatasetError(file, name, problem, "Give the same number for each key")
         if n == 0:
             raise DatasetError(file, name, "holds no example", "Give at least one observation of the solved task")
         if array.dtype == np.uint8 and array.ndim == 4 and array.max() <= 1:
             remedy = "Multiply them by 255 before casting to uint8"
-            raise DatasetError(file, name, "holds only the pixel values 0 and 1", remedy)
+            raise DatasetError(file, name, "holds only the values 0 and 1", remedy)
     if isinstance(observation_space, spaces.Dict):
         return {name.removeprefix("examples/"): array for name, array in arrays.items()}
     return arrays["examples"]
@@ -77,15 +79,17 @@ def save_examples(
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """
-    Write success examples to an HDF5 file, replacing an older one whole.
+    Write success examples to an HDF5 file. An existing file is replaced in one step.
 
-    :param path: the file
-    :param observations: ``(n, *shape)``, or a dict of such for a Dict space
+    :param path: the file; it may begin with ``~``
+    :param observations: ``(n, *shape)``, or a dict of such arrays for a Dict space
     :param observation_space: space of one observation
-    :param provenance: where they come from (JSON)
+    :param provenance: origin of the examples (JSON)
+    :raises DatasetError: if the observations do not fit the space
     """
+    path = Path(path).expanduser()
     arrays = check_observations(observations, observation_space, None, path)
-    with replacing(Path(path)) as temporary, h5py.File(temporary, "w", locking=False) as file:
+    with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
         file.attrs["format"] = EXAMPLES_FORMAT
         file.attrs["format_version"] = EXAMPLES_VERSION
         file.attrs["observation_space"] = space_to_json(observation_space)
@@ -98,7 +102,7 @@ def _read_hdf5(path: Path) -> Observations:
     with open_hdf5(path) as file:
         if file.attrs.get("format") != EXAMPLES_FORMAT or file.attrs.get("format_version") != EXAMPLES_VERSION:
             found = f"is {file.attrs.get('format')!r} version {file.attrs.get('format_version')}"
-            remedy = "Extract examples from a dataset first (sb3-offline examples), or give .npz, .npy or a folder of pictures"
+            remedy = "Extract examples from a dataset first (sb3-offline examples), or give .npz, .npy or a folder of images"
             raise DatasetError(path, "attribute format", f"{found}, expected {EXAMPLES_FORMAT!r} {EXAMPLES_VERSION}", remedy)
         node = file.get("observations")
         if node is None:
@@ -112,54 +116,54 @@ def _read_numpy(path: Path, space: spaces.Space) -> Observations:
         arrays = loaded if isinstance(loaded, np.ndarray) else dict(loaded)
     except FileNotFoundError as error:
         raise DatasetError(path, "file", "does not exist", "Check the path") from error
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:  # not NumPy's format, cut off, or pickled objects
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:  # another format, truncated, or pickled objects
         raise DatasetError(path, "file", f"cannot be read ({error})", "Save plain arrays with numpy.savez") from error
     if isinstance(arrays, np.ndarray) or isinstance(space, spaces.Dict):
         return arrays
     if "observations" not in arrays and len(arrays) != 1:
-        problem = f"holds the arrays {sorted(arrays)}, none of them called 'observations'"
+        problem = f"holds the arrays {sorted(arrays)}, none of which is called 'observations'"
         raise DatasetError(path, "observations", problem, "Rename the array of examples, or save it alone")
     return arrays["observations"] if "observations" in arrays else next(iter(arrays.values()))
 
 
-def _read_pictures(folder: Path, space: spaces.Space) -> np.ndarray:
+def _read_images(folder: Path, space: spaces.Space) -> np.ndarray:
     """:return: (n, height, width, channels) uint8"""
     from PIL import Image, ImageOps
 
     if not (isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3):
-        problem = f"holds pictures, but the observation space is {space}"
-        raise DatasetError(folder, "examples", problem, "Pictures need a space of uint8 images")
+        problem = f"holds images, but the observation space is {space}"
+        raise DatasetError(folder, "examples", problem, "A folder of images needs a space of uint8 images")
     height, width, channels = _channels_last(space.shape)
     mode = {1: "L", 3: "RGB"}.get(channels)
     if mode is None:
-        problem = f"holds single pictures, but an observation has {channels} channels"
+        problem = f"holds single images, but an observation has {channels} channels"
         raise DatasetError(folder, "examples", problem, "Stack the frames yourself and give an array or .npz")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
-        raise DatasetError(folder, "examples", "holds no .png, .jpg or .jpeg", "Put pictures of the solved task there")
+        raise DatasetError(folder, "examples", "holds no .png, .jpg or .jpeg", "Put images of the solved task there")
     frames = np.empty((len(paths), height, width, channels), np.uint8)
     for frame, path in zip(frames, paths, strict=True):
         try:
             with Image.open(path) as image:
                 if image.mode not in EIGHT_BIT_MODES:
-                    problem = f"has pixels of Pillow's mode {image.mode}"
-                    raise DatasetError(path, "picture", problem, "Save it with 8 bits a channel")
-                # Photographs hold their rotation in a tag; and averaging filters, or thin things vanish
+                    problem = f"has Pillow's mode {image.mode}"
+                    raise DatasetError(path, "image", problem, "Save it with 8 bits per channel")
+                # The rotation of a photograph is stored in a tag. BOX averages, so that thin objects stay visible
                 upright = ImageOps.exif_transpose(image).convert(mode)
                 frame[:] = np.asarray(upright.resize((width, height), Image.Resampling.BOX)).reshape(frame.shape)
         except OSError as error:
-            raise DatasetError(path, "picture", f"cannot be read ({error})", "Save it again, or take it out") from error
+            raise DatasetError(path, "image", f"cannot be read ({error})", "Save it again, or remove it") from error
     return frames
 
 
 def _channels_last(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """:return: (height, width, channels) of an image shape in either layout; the smallest axis at an end is the channels"""
+    """:return: (height, width, channels) of an image shape in either layout: the smaller of the outer axes is the channels"""
     first, middle, last = shape
     return (middle, last, first) if first < last else (first, middle, last)
 
 
 def _match_layout(array: np.ndarray, space: spaces.Space) -> np.ndarray:
-    """Turn images channel-first or channel-last where that makes them fit; anything else is left for the check."""
+    """:return: images in the other layout if that makes them fit the space; any other array as it is"""
     shape = tuple(space.shape or ())
     if array.ndim == 4 and len(shape) == 3 and array.shape[1:] != shape:
         for axes in ((0, 3, 1, 2), (0, 2, 3, 1)):

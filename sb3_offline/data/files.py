@@ -1,4 +1,4 @@
-"""Files replaced whole or not at all, and HDF5 files opened with errors that name the remedy."""
+"""Tools for files: atomic replacement, locks, and HDF5 files whose errors name a remedy."""
 
 import contextlib
 import os
@@ -15,7 +15,8 @@ from sb3_offline.data.errors import DatasetError
 def temporary_path(path: Path) -> Path:
     """
     :param path: the file that is to be written
-    :return: its temporary neighbour; always the same, so that what a killed process left is found and overwritten
+    :return: a temporary file in the same folder. Its name depends only on ``path``, so that the next writer finds and
+        overwrites the file of a killed process
     """
     return path.with_name(f".{path.name}.tmp")
 
@@ -23,10 +24,12 @@ def temporary_path(path: Path) -> Path:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """
-    Write a file so that a reader, or a process started after a kill or a power cut, sees the old or the new one whole.
+    Replace a file in one step. A reader, also one that starts after a kill or a power cut, sees either the old file or the new
+    one, and always a complete one.
 
     :param path: the file to create or replace
-    :return: context manager giving the temporary path to write to; it replaces ``path`` when the block ends well
+    :return: context manager that gives a temporary path to write to. The temporary file replaces ``path`` if the block ends
+        without an error, and is deleted otherwise
     """
     path = Path(os.path.realpath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,7 +38,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         _sync(temporary)
         os.replace(temporary, path)
-        if os.name == "posix":  # the rename itself lives in the directory, which other systems cannot open
+        if os.name == "posix":  # the directory stores the rename; other systems cannot open directories
             _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
@@ -51,11 +54,13 @@ def _sync(path: Path) -> None:
 
 def lock_file(file: Any, path: Path, *, wait: bool = False) -> None:
     """
-    Refuse a second writer: two would write over each other's work. The lock goes with the process, also when killed.
+    Lock a file against a second writer, since two writers would destroy each other's work. A process that ends or is killed
+    loses its locks.
 
-    :param file: open; closing it frees the lock
-    :param path: for the ``DatasetError`` that is raised where another process holds it
-    :param wait: wait for that process instead
+    :param file: the open file; closing it frees the lock
+    :param path: its path, for the error message
+    :param wait: wait until another process frees the lock
+    :raises DatasetError: if another process holds the lock and ``wait`` is false
     """
     if sys.platform == "win32":
         return
@@ -73,12 +78,13 @@ def lock_file(file: Any, path: Path, *, wait: bool = False) -> None:
 @contextlib.contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
     """
-    Wait for whoever else is in this block with the same folder: for files that are read, changed and replaced.
+    Lock a folder in which files are read, changed and replaced. The block waits until no other process is in such a block with
+    the same folder.
 
-    :param folder: an existing one
-    :return: context manager; without a lock where the system has none for folders
+    :param folder: an existing folder
+    :return: context manager; it does not lock on systems that cannot lock folders
     """
-    if sys.platform == "win32":  # where folders cannot be opened
+    if sys.platform == "win32":  # folders cannot be opened there
         yield
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -92,7 +98,8 @@ def locked_folder(folder: Path) -> Iterator[None]:
 def open_hdf5(path: str | os.PathLike) -> h5py.File:
     """
     :param path: an HDF5 file
-    :return: the file opened for reading, without HDF5's file lock: a dataset may be read while a writer appends to it
+    :return: the file, opened for reading without HDF5's file lock, so that it can be read while a writer appends to it
+    :raises DatasetError: if the file does not exist or is damaged
     """
     if not os.path.isfile(path):
         raise DatasetError(path, "file", "does not exist", "Check the path")
@@ -103,7 +110,7 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
             except OSError as error:
                 if "file locking" not in str(error):
                     raise
-        # This process has it open with the lock, and HDF5 wants all openings alike.
+        # This process has the file open with the lock, and HDF5 requires the same setting each time.
         return h5py.File(path, "r", locking=True)
     except OSError as error:
         if "truncated file" in str(error):

@@ -1,7 +1,7 @@
 """
-The dataset format, version 1, as code; docs/dataset_format.md says the same in words.
+The dataset format, version 1. The page docs/dataset_format.md describes it in words.
 
-One HDF5 file holds E episodes of together N steps. Arrays are flat over all steps, and each episode has one more row of
+One HDF5 file holds E episodes with N steps in total. Arrays are flat over all steps. Each episode has one more row of
 observations than it has steps, so that no observation is stored twice.
 """
 
@@ -21,8 +21,8 @@ from sb3_offline.data.spaces import space_from_json, space_to_json, subspaces
 
 FORMAT = "sb3-offline-dataset"
 FORMAT_VERSION = 1
-# About this much of an array becomes one chunk of compressed storage: 50 frames of 64x64x3, so that gzip finds the
-# previous frames in its window, and few enough bytes for HDF5's default chunk cache of 1 MiB.
+# Size of a chunk in compressed storage. These are 50 frames of 64x64x3: gzip finds the previous frames in its window, and a
+# chunk fits into HDF5's default chunk cache of 1 MiB.
 CHUNK_BYTES = 50 * 64 * 64 * 3
 
 Storage = Literal["contiguous", "compressed"]
@@ -32,7 +32,7 @@ class Field(NamedTuple):
     """
     One array of the file.
 
-    :param per: what one row belongs to: "episode" (E rows), "step" (N rows) or "observation" (N + E rows)
+    :param per: the unit that has one row: "episode" (E rows), "step" (N rows) or "observation" (N + E rows)
     :param shape: shape of one row
     :param dtype: dtype of the values
     """
@@ -42,26 +42,33 @@ class Field(NamedTuple):
     dtype: np.dtype
 
     def rows(self, n_episodes: int, n_steps: int) -> int:
-        """:return: the number of rows for so many episodes and steps"""
+        """
+        :param n_episodes: number of episodes
+        :param n_steps: number of steps in all episodes
+        :return: number of rows of the array
+        """
         return {"episode": n_episodes, "step": n_steps, "observation": n_steps + n_episodes}[self.per]
 
     @property
     def row_bytes(self) -> int:
+        """:return: size of one row, in bytes"""
         return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
 
 
 @dataclass
 class Header:
     """
-    What a file says about its arrays: its attributes, and which of the optional arrays it has.
+    The attributes of a file, and which of the optional arrays it has.
 
-    :param env_id: gymnasium id, "" where there is none
+    :param observation_space: space of one observation
+    :param action_space: space of one action
+    :param env_id: gymnasium ID of the environment, or ""
     :param env_kwargs: keyword arguments of the environment (JSON)
-    :param provenance: where the data come from: program, command, seed, versions, policy, ... (JSON)
-    :param sources: labels of the episodes' sources, e.g. the scripted policy; ``None``: episodes have none
+    :param provenance: origin of the data: program, command, seed, versions, policy, ... (JSON)
+    :param sources: labels of the episodes' sources, e.g. names of scripted policies; ``None`` if episodes have no labels
     :param rewards: whether the file has rewards
     :param success: whether the file has success labels
-    :param extras: further arrays with one row per step: name to (shape of one row, dtype)
+    :param extras: further arrays with one row for each step: name to (shape of one row, dtype)
     """
 
     observation_space: spaces.Space
@@ -75,7 +82,7 @@ class Header:
     extras: Mapping[str, tuple[tuple[int, ...], Any]] = field(default_factory=dict)
 
     def fields(self) -> dict[str, Field]:
-        """:return: all arrays of the file by their HDF5 name, apart from ``n_episodes``"""
+        """:return: all arrays of the file but ``n_episodes``, by their HDF5 names"""
         episode_dtypes = {"length": np.int64, "seed": np.int64}
         if self.sources is not None:
             episode_dtypes["source"] = np.int16
@@ -111,12 +118,13 @@ class Header:
 def read_header(file: h5py.File, path: str | os.PathLike) -> Header:
     """
     :param file: an open file of this format
-    :param path: for error messages
-    :return: its header; raises ``DatasetError`` on another format, a newer version, or unreadable attributes
+    :param path: its path, for error messages
+    :return: its header
+    :raises DatasetError: if the format is another one, the version is newer, or an attribute cannot be read
     """
     if file.attrs.get("format") != FORMAT:
         problem = f"is {file.attrs.get('format')!r}, expected {FORMAT!r}"
-        remedy = "Give a dataset written by DatasetWriter, or a D4RL-style file (observations, actions, terminals)"
+        remedy = "Give a dataset written by DatasetWriter, or convert the file first (sb3-offline convert)"
         raise DatasetError(path, "attribute format", problem, remedy)
     version = file.attrs.get("format_version")
     if version != FORMAT_VERSION:
@@ -150,19 +158,20 @@ def create_file(
     path: Path, header: Header, n_episodes: int, n_steps: int, *, committed: int, storage: Storage = "contiguous"
 ) -> None:
     """
-    Create a file with room for so many episodes and steps. Contiguous arrays are given their place and left unwritten: they
-    take no space on disk before rows are written to them.
+    Create a file with room for a number of episodes and steps. Contiguous arrays get their places in the file but are not
+    written, so that they take no space on disk before rows are written to them.
 
-    :param path: file to create (or overwrite)
-    :param header: attributes and fields
-    :param n_episodes: room for episodes
-    :param n_steps: room for steps
-    :param committed: what ``n_episodes`` in the file says: how many episodes exist
+    :param path: file to create or overwrite
+    :param header: attributes and arrays
+    :param n_episodes: number of episodes that there is room for
+    :param n_steps: number of steps that there is room for
+    :param committed: number of episodes that exist, the value of ``n_episodes`` in the file
     :param storage: "contiguous" (for training) or "compressed" (for keeping and sending)
+    :raises TypeError: if there is no such storage
     """
     if storage not in get_args(Storage):
         raise TypeError(f"storage is {storage!r}; choose 'contiguous' or 'compressed'")
-    # Arrays at whole pages: a memory-mapped row then touches no more pages than it must.
+    # Arrays begin at whole pages, so that reading a memory-mapped row touches as few pages as possible.
     with h5py.File(path, "w", locking=False, alignment_threshold=4096, alignment_interval=4096) as file:
         for name, value in header.attributes().items():
             file.attrs[name] = value

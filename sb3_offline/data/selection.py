@@ -1,4 +1,4 @@
-"""Episodes of datasets chosen by their labels: what was attempted (``source``), and whether it succeeded (``success``)."""
+"""Selection of episodes by their labels: what was attempted (``source``), and whether it succeeded (``success``)."""
 
 from collections.abc import Sequence
 
@@ -10,15 +10,15 @@ from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
 
 def select_episodes(dataset: DatasetSource, *, source: str | None = None, success: bool | None = None) -> list[OfflineDataset]:
     """
-    Open datasets with some of their episodes only, e.g. for the imitation of successful ones.
+    Open datasets with only some of their episodes, e.g. to imitate the successful ones.
 
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these
-    :param source: episodes of this source only, e.g. "door-open" in a file of attempts at several tasks
-    :param success: episodes that were solved at one step at least (``True``), or at none (``False``)
-    :return: the datasets that hold such episodes, with these alone; raises ``DatasetError`` where there is no such episode, or
-        no such label
+    :param source: label of the episodes to select, e.g. "door-open" in a file of attempts at several tasks (default: all)
+    :param success: ``True`` selects episodes that were solved at any step, ``False`` those that never were (default: all)
+    :return: the datasets that have such episodes, with these episodes alone
+    :raises DatasetError: if there is no such episode, no such source, or no success labels
     """
-    chosen, datasets = [], open_datasets(dataset)
+    selected, datasets = [], open_datasets(dataset)
     if source is not None:
         check_source(datasets, source)
     for part in datasets:
@@ -29,26 +29,30 @@ def select_episodes(dataset: DatasetSource, *, source: str | None = None, succes
                 raise DatasetError(part.path, "success", "is missing: the file has no success labels", remedy)
             wanted &= np.logical_or.reduceat(part.success, part.step_starts) == success
         if wanted.any():
-            chosen.append(part.select(np.flatnonzero(wanted)))
-    if not chosen:
+            selected.append(part.select(np.flatnonzero(wanted)))
+    if not selected:
         problem = f"holds no episode with source={source!r} and success={success}"
-        raise DatasetError(datasets[0].path, "episodes", problem, "Collect more episodes, or choose other ones")
-    return chosen
+        raise DatasetError(datasets[0].path, "episodes", problem, "Collect more episodes, or select others")
+    return selected
 
 
 def check_source(datasets: Sequence[OfflineDataset], source: str) -> None:
-    """Raise ``DatasetError`` where a dataset has no labels of its episodes' sources, or none of them knows this one."""
-    known = list(dict.fromkeys(name for dataset in datasets for name in dataset.sources))
+    """
+    :param datasets: open datasets
+    :param source: label of episodes
+    :raises DatasetError: if a dataset has no labels of its episodes' sources, or if none of the datasets has this label
+    """
+    labels = list(dict.fromkeys(label for dataset in datasets for label in dataset.sources))
     for dataset in datasets:
-        if dataset.source is None or source not in known:
-            raise DatasetError(dataset.path, "source", f"has no {source!r}", f"The sources are {known}")
+        if dataset.source is None or source not in labels:
+            raise DatasetError(dataset.path, "source", f"has no {source!r}", f"The sources are {labels}")
 
 
 def of_source(dataset: OfflineDataset, source: str) -> np.ndarray:
     """
-    :param dataset: with labels of its episodes' sources
-    :param source: one of them, or of another dataset's
-    :return: (E,) bool, which episodes are of this source
+    :param dataset: an open dataset
+    :param source: label of episodes
+    :return: (E,) bool, true for the episodes with this label
     """
     if dataset.source is None or source not in dataset.sources:
         return np.zeros(dataset.n_episodes, dtype=bool)

@@ -15,18 +15,20 @@ from sb3_offline.data.errors import DatasetError
 def space_to_json(space: spaces.Space) -> str:
     """
     :param space: a Box, Discrete, MultiDiscrete or MultiBinary space, or a Dict of these
-    :return: JSON text; ``space_from_json`` gives an equal space back
+    :return: JSON text, which ``space_from_json`` turns into an equal space
+    :raises DatasetError: if the space is of another kind, or if it would change
     """
     text = json.dumps(_encode(space))
     if space_from_json(text) != space:
-        raise DatasetError("", "space", f"{space} cannot be stored: it would come back as another", "Wrap the environment")
+        raise DatasetError("", "space", f"{space} cannot be stored: it would be read as another space", "Wrap the environment")
     return text
 
 
 def space_from_json(text: str) -> spaces.Space:
     """
-    :param text: what ``space_to_json`` wrote; anything else raises ``ValueError``, ``KeyError`` or ``TypeError``
+    :param text: JSON text from ``space_to_json``
     :return: the space
+    :raises ValueError: (or ``KeyError``, ``TypeError``) if the text describes no space
     """
     return _decode(json.loads(text))
 
@@ -52,7 +54,7 @@ def _decode(data: dict[str, Any]) -> spaces.Space:
     kind = data["type"]
     if kind == "Box":
         shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
-        exact = np.float64 if dtype.kind == "f" else dtype  # large integers are none of the floats'
+        exact = np.float64 if dtype.kind == "f" else dtype  # floats cannot represent large integers
         low, high = (np.broadcast_to(np.array(data[k], dtype=exact), shape).astype(dtype) for k in ("low", "high"))
         return spaces.Box(low, high, shape, dtype.type)
     if kind == "Discrete":
@@ -67,7 +69,7 @@ def _decode(data: dict[str, Any]) -> spaces.Space:
 
 
 def _encode_bound(bound: np.ndarray) -> Any:
-    """One number where all are equal. Infinities become strings, since JSON has none (NumPy parses them back)."""
+    """:return: one number if all are equal, else nested lists. Infinities become strings, which NumPy parses: JSON has none"""
     uniform = bound.size > 0 and (bound == bound.flat[0]).all()
     values = np.asarray(bound.flat[0] if uniform else bound).astype(object)
 
@@ -80,7 +82,7 @@ def _encode_bound(bound: np.ndarray) -> Any:
 def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
     """
     :param space: any space
-    :param name: how the arrays of this space are called, e.g. "observations"
+    :param name: name of the arrays of this space, e.g. "observations"
     :return: the plain spaces by array name: ``{name: space}``, or ``{name/key: subspace}`` for a Dict space
     """
     if isinstance(space, spaces.Dict):
@@ -89,7 +91,11 @@ def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
 
 
 def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
-    """:return: whether two action spaces are the same, floats of either precision: files hold float32 in any case"""
+    """
+    :param space: an action space
+    :param other: another action space
+    :return: whether they are the same, apart from the precision of floats: files hold float32 in any case
+    """
     if isinstance(space, spaces.Box) and isinstance(other, spaces.Box) and space.dtype.kind == other.dtype.kind == "f":
         one, two = (np.array([box.low, box.high], np.float32) for box in (space, other))
         return np.array_equal(one, two)
@@ -102,12 +108,13 @@ def check_observations(
     """
     Check rows of observations against their space.
 
-    :param value: array of shape (rows, *space.shape), or a dict of such for a Dict space
+    :param value: array of shape ``(rows, *space.shape)``, or a dict of such arrays for a Dict space
     :param space: the space of one observation
     :param rows: expected number of rows, ``None`` for any
-    :param file: for the error message
-    :param name: how these arrays are called
-    :return: arrays of the space's dtype by their names, as in ``subspaces``
+    :param file: for error messages
+    :param name: name of these arrays, as for ``subspaces``
+    :return: arrays of the space's dtype, by their names
+    :raises DatasetError: if a shape, a dtype or a value does not fit the space
     """
     parts = {name: value}
     if isinstance(space, spaces.Dict):
@@ -119,7 +126,7 @@ def check_observations(
     for field, subspace in subspaces(space, name).items():
         shape, dtype = tuple(subspace.shape or ()), np.dtype(subspace.dtype)
         checked[field] = check_rows(parts[field], shape, dtype, rows, file, field)
-        # Only images: the bounds of other observations are often a guess that environments do not keep
+        # Only images: environments often exceed the bounds that they declare for other observations
         if isinstance(subspace, spaces.Box) and dtype.kind == "f" and len(shape) == 3 and checked[field].size:
             _check_range(checked[field], subspace.low.min(), subspace.high.max(), file, field)
         elif isinstance(subspace, spaces.Discrete | spaces.MultiDiscrete):
@@ -130,9 +137,10 @@ def check_observations(
 def to_array(value: Any, file: str | os.PathLike, field: str) -> np.ndarray:
     """
     :param value: array-like
-    :param file: for the error message
-    :param field: for the error message
-    :return: the array; raises ``DatasetError`` where rows differ in shape
+    :param file: for error messages
+    :param field: for error messages
+    :return: the array
+    :raises DatasetError: if rows differ in shape
     """
     try:
         return np.asarray(value)
@@ -144,16 +152,17 @@ def check_rows(
     value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
 ) -> np.ndarray:
     """
-    Check rows of one array, and convert them to its dtype where that changes no value by more than rounding.
+    Check rows of one array, and convert them to a dtype. The conversion changes values by rounding at most.
 
     :param value: array-like of shape ``(rows, *shape)``
     :param shape: shape of one row
     :param dtype: dtype of the result
     :param rows: expected number of rows, ``None`` for any
-    :param file: for the error message
-    :param field: for the error message
-    :return: array of shape ``(rows, *shape)``; raises ``DatasetError`` on another shape or dtype, values outside of the
-        dtype's range, NaN or infinity
+    :param file: for error messages
+    :param field: for error messages
+    :return: array of shape ``(rows, *shape)``
+    :raises DatasetError: if the shape is another one, if the dtype does not fit, or if a value is NaN, infinite, or outside of
+        the range of the dtype
     """
     array = _shaped(value, shape, rows, file, field)
     if array.dtype.kind not in "iubf" or (array.dtype.kind == "f" and dtype.kind in "iu"):
@@ -179,8 +188,8 @@ def check_extra(
     value: Any, shape: tuple[int, ...], dtype: np.dtype, rows: int | None, file: str | os.PathLike, field: str
 ) -> np.ndarray:
     """
-    :func:`check_rows`, with the same arguments, for arrays that mean nothing to a learner: their floats may be NaN or
-    infinite, and they may be text.
+    Check rows like :func:`check_rows`, with the same arguments, for arrays that no learner uses. Floats may be NaN or
+    infinite, and rows may be text.
     """
     if dtype.kind not in "fS":
         return check_rows(value, shape, dtype, rows, file, field)

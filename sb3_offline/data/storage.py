@@ -1,4 +1,4 @@
-"""Rows of observations from one or several files, out of memory or out of a memory map."""
+"""Rows of arrays that are spread over one or several files, in memory or in the files."""
 
 import os
 from collections.abc import Sequence
@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 
+from sb3_offline.data.arrays import ArrayLike
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import ArrayLike, OfflineDataset
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.spaces import subspaces
 
 READ_BYTES = 1 << 26
@@ -15,27 +16,43 @@ READ_BYTES = 1 << 26
 
 class RowStore:
     """
-    The rows of one array, numbered through several parts.
+    The rows of several arrays, one array after the other. Nothing is read before it is indexed.
 
-    :param parts: arrays of the same row shape and dtype: one per file, or a single one
+    :param parts: arrays with rows of the same shape and dtype, e.g. one for each file
     """
 
-    def __init__(self, parts: Sequence[np.ndarray]):
+    def __init__(self, parts: Sequence[ArrayLike]):
         self.parts = list(parts)
         self.ends = np.cumsum([len(part) for part in self.parts])
+        self.shape, self.dtype = (int(self.ends[-1]), *self.parts[0].shape[1:]), self.parts[0].dtype
 
     def __len__(self) -> int:
-        return int(self.ends[-1])
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice | np.ndarray) -> np.ndarray:
+        """
+        :param rows: a slice without a step, or (B,) indices of rows
+        :return: these rows; for a slice within one part a view, if the part gives one
+        """
+        if not isinstance(rows, slice):
+            return self.take(rows)
+        first, last, _ = rows.indices(len(self))
+        starts = self.ends - [len(part) for part in self.parts]
+        lows, highs = np.maximum(first - starts, 0), np.minimum(last, self.ends) - starts
+        pieces = [part[low:high] for part, low, high in zip(self.parts, lows, highs, strict=True) if low < high]
+        if len(pieces) == 1:
+            return np.asarray(pieces[0])
+        return np.concatenate([np.empty((0, *self.shape[1:]), self.dtype), *pieces])
 
     def take(self, rows: np.ndarray) -> np.ndarray:
         """
-        :param rows: (B,) row numbers
-        :return: ``(B, *shape)`` a copy of these rows
+        :param rows: (B,) indices of rows
+        :return: ``(B, *shape)``, a copy of these rows
         """
         if len(self.parts) == 1:
             return self.parts[0].take(rows, axis=0)
         part_of_row = np.searchsorted(self.ends, rows, side="right")
-        out = np.empty((len(rows), *self.parts[0].shape[1:]), self.parts[0].dtype)
+        out = np.empty((len(rows), *self.shape[1:]), self.dtype)
         for part in np.unique(part_of_row):
             here = part_of_row == part
             first_row = self.ends[part] - len(self.parts[part])
@@ -48,9 +65,10 @@ def observation_stores(
 ) -> tuple[dict[str, RowStore], Literal["memory", "mmap"]]:
     """
     :param datasets: datasets of the same spaces
-    :param storage: "memory" reads all observations once, "mmap" leaves them on disk and needs contiguous storage, "auto" maps
-        where they would take more than half of the memory that is available now
+    :param storage: "memory" reads all observations once. "mmap" leaves them on disk and needs contiguous storage. "auto" is
+        "mmap" if they would take more than half of the memory that is available now, else "memory"
     :return: the observations by array name (``observations`` or ``observations/key``), and the storage that was chosen
+    :raises DatasetError: if "mmap" was chosen, and a file is compressed
     """
     names = list(subspaces(datasets[0].observation_space, "observations"))
     columns: dict[str, list[ArrayLike]] = {name: [dataset.arrays[name] for dataset in datasets] for name in names}
@@ -65,19 +83,19 @@ def observation_stores(
                 problem = "is compressed and cannot be memory-mapped"
                 remedy = "Convert it to contiguous storage (sb3-offline convert), or use storage='memory' if it fits"
                 raise DatasetError(dataset.path, "observations", problem, remedy)
-        return {name: RowStore(column) for name, column in columns.items()}, "mmap"  # type: ignore[arg-type]
+        return {name: RowStore(column) for name, column in columns.items()}, "mmap"
     return {name: RowStore([_read_all(column)]) for name, column in columns.items()}, "memory"
 
 
 def available_memory() -> int:
-    """:return: bytes of memory that this process may still take, as far as the system says"""
+    """:return: number of bytes of memory that this process may still take, as far as the system says"""
     available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 1 << 33
     try:
         with open("/proc/meminfo") as file:
             values = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in file}
         available = values.get("MemAvailable", available)
         with open("/sys/fs/cgroup/memory.max") as limit, open("/sys/fs/cgroup/memory.current") as current:
-            return min(available, int(limit.read()) - int(current.read()))  # a container's limit; "max" where it has none
+            return min(available, int(limit.read()) - int(current.read()))  # the limit of a container; "max" if there is none
     except (OSError, ValueError):
         return available
 
@@ -87,7 +105,7 @@ def _row_bytes(array: ArrayLike) -> int:
 
 
 def _read_all(column: Sequence[ArrayLike]) -> np.ndarray:
-    """Read the arrays one after another into a single one, by pieces: a compressed array never exists twice in memory."""
+    """:return: all arrays in a single one. They are read in pieces, so that a compressed array never exists twice in memory"""
     if len(column) == 1 and isinstance(column[0], np.ndarray) and column[0].base is None:
         return column[0]  # in memory already
     out = np.empty((sum(len(array) for array in column), *column[0].shape[1:]), column[0].dtype)

@@ -1,4 +1,4 @@
-"""A writer that commits whole episodes: a process killed at any moment leaves a file that opens and holds them all."""
+"""A writer that commits whole episodes. A process killed at any moment leaves a file that opens and holds all of them."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -21,25 +21,27 @@ class DatasetWriter:
     """
     Write a dataset file of format version 1, one whole episode at a time.
 
-    How it survives a kill: the HDF5 file is created with room to spare (sparse, so that the room takes no space on disk) and
-    closed; from then on no HDF5 metadata changes. An episode's rows go straight to their places in the file, are
-    synced to disk, and only then one write of 8 bytes to ``n_episodes`` makes the episode exist. When the room is used up, and
-    at the end, the rows are copied to a new file of the right size that replaces the old one in one step.
+    It survives a kill as follows. The HDF5 file is created with spare room (which takes no space on disk, since the file is
+    sparse) and closed. From then on, no HDF5 metadata change. The rows of an episode are written to their places in the
+    file and synced to disk. Only then, one write of 8 bytes to ``n_episodes`` makes the episode exist. When the room is used
+    up, and at the end, the rows are copied to a new file of the right size, which replaces the old one in one step.
 
-    :param path: the file to write
+    :param path: the file to write; it may begin with ``~``
     :param observation_space: space of one observation (Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these)
     :param action_space: space of one action, in the environment's own units
-    :param env_id: gymnasium id of the environment, if any
-    :param env_kwargs: its keyword arguments (JSON)
-    :param provenance: where the data come from: program, command, seed, versions, policy, ... (JSON). When appending, a
-        provenance other than the file's is added to the list ``provenance["appended"]``
-    :param mode: "x": the file must not exist; "w": replace it, once the first episode is there (or on closing without an
-        error); "a": append to it (which copies it once), or create it
+    :param env_id: gymnasium ID of the environment, if any
+    :param env_kwargs: keyword arguments of the environment (JSON)
+    :param provenance: origin of the data: program, command, seed, versions, policy, ... (JSON). If a file with another
+        provenance is appended to, this one is added to the list ``provenance["appended"]``
+    :param mode: "x" creates a file, which must not exist. "w" replaces a file when the first episode has been added, or on
+        closing without an error. "a" appends to a file (which copies it once), or creates it
     :param rewards: whether episodes have rewards
     :param success: whether episodes have success labels
-    :param extras: further per-step arrays: name to (shape of one row, dtype)
+    :param extras: further arrays with one row for each step: name to (shape of one row, dtype)
     :param sources: labels that episodes may name as their source
-    :param capacity: room for so many (episodes, steps) at first; it grows by itself, at the price of copying the file
+    :param capacity: room for (episodes, steps) at first. It grows by itself, at the price of copying the file
+    :raises DatasetError: if the file exists (mode "x"), is being written by another process, or has other spaces or arrays
+        than those to be appended
     """
 
     def __init__(
@@ -58,13 +60,13 @@ class DatasetWriter:
         sources: Sequence[str] | None = None,
         capacity: tuple[int, int] = (1024, 65536),
     ):
-        self.path = Path(os.path.realpath(path))
-        if mode not in ("x", "w", "a"):  # or a mistyped mode would replace the file
+        self.path = Path(os.path.realpath(os.path.expanduser(path)))
+        if mode not in ("x", "w", "a"):  # checked here, since a mistyped mode would replace the file
             raise DatasetError(self.path, "mode", f"is {mode!r}", "Give 'x', 'w' or 'a'")
         self.n_episodes = 0
         self.n_steps = 0
         self._file: Any = None
-        self._replaces = False  # whether the file at the path still is the old one, which this one is to replace
+        self._replaces = False  # whether the file at the path is an old one that is still to be replaced
         self._header = Header(
             observation_space,
             action_space,
@@ -80,7 +82,7 @@ class DatasetWriter:
         try:
             self._open(mode, capacity)
         except BaseException:
-            self._release()  # the error's traceback keeps this object, and with it the lock
+            self._release()  # the traceback of the error would keep this object alive, and with it the lock
             raise
 
     def _open(self, mode: str, capacity: tuple[int, int]) -> None:
@@ -90,10 +92,10 @@ class DatasetWriter:
             self._attach()
             if mode == "a":
                 self._adopt()
-        temporary_path(self.path).unlink(missing_ok=True)  # what a killed writer left; the lock says that it is gone
+        temporary_path(self.path).unlink(missing_ok=True)  # left by a killed writer: we hold the lock, so no other is alive
         self._capacity = (self.n_episodes + max(capacity[0], 1), self.n_steps + max(capacity[1], 1))
         if self._file is not None and mode == "w":
-            self._header.attributes()  # what cannot be stored is refused here already
+            self._header.attributes()  # raises early if an attribute cannot be stored
             self._replaces = True
         else:
             self._rewrite(self._capacity)
@@ -112,18 +114,19 @@ class DatasetWriter:
         source: str | None = None,
     ) -> None:
         """
-        Write one episode of T steps. When this returns, the episode is in the file, whatever happens to the process.
-        Nothing is written unless all of it is valid (``DatasetError`` otherwise).
+        Write one episode of T steps. When this method returns, the episode is in the file, whatever happens to the process.
 
-        :param observations: ``(T + 1, *shape)``, or a dict of such for a Dict space: the last observation too
+        :param observations: ``(T + 1, *shape)`` with the observation after the last step, or a dict of such arrays for a Dict
+            space
         :param actions: ``(T, *shape)`` in the environment's units
         :param rewards: (T,) float; required if the file has rewards
-        :param terminated: (T,) bool, true at most in the last step; default: never
-        :param truncated: (T,) bool, true at most in the last step; default: in the last step, if that did not terminate
+        :param terminated: (T,) bool, true at most in the last step (default: false)
+        :param truncated: (T,) bool, true at most in the last step (default: true in the last step if it did not terminate)
         :param success: (T,) bool, success after each step; required if the file has success labels
-        :param extras: the file's further arrays, each with T rows
+        :param extras: the further arrays of the file, each with T rows
         :param seed: seed of the episode, -1 for none
-        :param source: one of the file's source labels; required if it has any
+        :param source: one of the file's source labels; required if the file has any
+        :raises DatasetError: if anything is invalid; nothing is written then
         """
         if self._file is None:
             raise DatasetError(self.path, "file", "is closed", "Open a new DatasetWriter with mode='a'")
@@ -150,7 +153,7 @@ class DatasetWriter:
         self.n_steps += n
 
     def close(self) -> None:
-        """Copy the file to its exact size (unless it has that already) and close it. Further calls do nothing."""
+        """Copy the rows to a file of their exact size, unless it has that size, and close it. Further calls do nothing."""
         if self._file is None:
             return
         try:
@@ -169,12 +172,12 @@ class DatasetWriter:
 
     def __exit__(self, exc_type: Any, *exc_info: Any) -> None:
         if exc_type is not None and self._replaces:
-            self._release()  # nothing came to replace the old file
+            self._release()  # keep the old file, since no episode was added
         else:
             self.close()
 
     def _check_steps(self, values: dict[str, Any], n: int) -> dict[str, np.ndarray]:
-        """Check the arrays with one row per step, given by their names in the file."""
+        """:return: the checked arrays that have one row for each step, by their names in the file"""
         expected = {name: spec for name, spec in self._fields.items() if spec.per == "step"}
         for name in expected.keys() ^ values.keys():
             if name in expected:
@@ -193,7 +196,7 @@ class DatasetWriter:
     def _episode_rows(self, n: int, seed: int, source: str | None) -> dict[str, np.ndarray]:
         if not (isinstance(seed, int | np.integer) and -(2**63) <= seed < 2**63):
             raise DatasetError(
-                self.path, "seed", f"is {seed!r}, no integer of 64 bits", "Give the episode's seed, or -1 for none"
+                self.path, "seed", f"is {seed!r}, not an integer of 64 bits", "Give the episode's seed, or -1 for none"
             )
         rows = {"episodes/length": np.array([n], np.int64), "episodes/seed": np.array([seed], np.int64)}
         sources = self._header.sources
@@ -210,7 +213,7 @@ class DatasetWriter:
         for name, array in rows.items():
             first_row = self._fields[name].rows(self.n_episodes, self.n_steps)
             self._write(self._offsets[name] + first_row * self._fields[name].row_bytes, array)
-        os.fsync(self._file.fileno())  # the order matters: rows on disk first, then the number that makes them exist
+        os.fsync(self._file.fileno())  # the order matters: first the rows must be on disk, then the number that counts them
         self._write(self._offsets["n_episodes"], np.array(self.n_episodes + 1, dtype=np.int64))
 
     def _write(self, offset: int, array: np.ndarray) -> None:
@@ -218,7 +221,7 @@ class DatasetWriter:
         _write_all(self._file, memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data))
 
     def _attach(self) -> None:
-        """Open the file at its path for writing, as the only writer."""
+        """Open the file at the path for writing, as the only writer."""
         self._release()
         self._file = open(self.path, "r+b", buffering=0)
         lock_file(self._file, self.path)
@@ -228,7 +231,7 @@ class DatasetWriter:
         self._capacity = (len(file["episodes/length"]), len(file["actions"]))
 
     def _adopt(self) -> None:
-        """Take over the episodes of the file, and what its header says."""
+        """Take over the episodes and the header of the existing file."""
         with open_hdf5(self.path) as file:
             present = read_header(file, self.path)
             self._check_same(present, file["actions"].chunks is not None)
@@ -252,13 +255,13 @@ class DatasetWriter:
             problem = f"has the spaces {present.observation_space} and {present.action_space}"
             raise DatasetError(self.path, "file", problem, "Append with the same spaces, or write another file")
         if present.fields() != wanted.fields():
-            problem = f"has other arrays ({sorted(present.fields())}) than those to be appended ({sorted(wanted.fields())})"
+            problem = f"has the arrays {sorted(present.fields())}, but the arrays to append are {sorted(wanted.fields())}"
             raise DatasetError(self.path, "file", problem, "Append with the same arrays, or write another file")
 
     def _rewrite(self, capacity: tuple[int, int], first: dict[str, np.ndarray] | None = None) -> None:
         """
-        Copy the committed rows to a file of another capacity, which then replaces this one; also creates a file, empty or with
-        the rows of its first episode.
+        Copy the committed rows to a file of another capacity, which then replaces this one. Without committed rows, create a
+        file that is empty or has the rows of its first episode.
         """
         with replacing(self.path) as temporary:
             create_file(temporary, self._header, *capacity, committed=1 if first else self.n_episodes)
@@ -277,15 +280,15 @@ class DatasetWriter:
             self._read_places(file)
 
 
-def _copy(source: Any, source_offset: int, target: Any, target_offset: int, size: int) -> None:
-    source.seek(source_offset)
+def _copy(origin: Any, origin_offset: int, target: Any, target_offset: int, size: int) -> None:
+    origin.seek(origin_offset)
     target.seek(target_offset)
     while size > 0:
-        data = source.read(min(size, COPY_BYTES))
+        data = origin.read(min(size, COPY_BYTES))
         _write_all(target, memoryview(data))
         size -= len(data)
 
 
 def _write_all(file: Any, data: memoryview) -> None:
-    while data:  # the system may write less than asked for (Linux: at most 2 GiB at once)
+    while data:  # the system may write less than requested (Linux: at most 2 GiB at once)
         data = data[file.write(data) :]

@@ -1,35 +1,33 @@
 """
-Minari datasets, in and out.
+Minari datasets, read and written.
 
 Nothing is lost in either direction. Infos become ``extras`` (``success`` becomes the success labels), and extras become
-infos. Minari has one more row of infos than there are steps, that of the reset: where it says anything, it stands in an
-array of its own, ``reset.<name>``, in the row of the episode's first step. Rewards and actions that float32 would round are
-kept exactly in ``exact.rewards`` and ``exact.actions``. Metadata go to ``provenance["minari"]``, those of episodes (options
-of their resets) to ``episode_metadata``, as JSON in the row of the first step.
+infos. Minari has one more row of infos than there are steps, the row of the reset. If it is not empty, it is kept in an array
+of its own, ``reset.<name>``, in the row of the episode's first step. Rewards and actions that float32 would round are kept
+exactly in ``exact.rewards`` and ``exact.actions``. Metadata are kept in ``provenance["minari"]``. The metadata of single
+episodes (options of their resets) are kept in ``episode_metadata``, as JSON in the row of the first step.
 """
 
 import json
-import os
 import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.flat import checked_observations
+from sb3_offline.data.foreign.base import Foreign, Format, Options, Scheme
+from sb3_offline.data.foreign.episodes import checked_observations
+from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.format import Header
 from sb3_offline.data.spaces import check_rows, space_to_json, subspaces
 
-if TYPE_CHECKING:
-    from sb3_offline.data.reader import OfflineDataset
-
 PREFIX = "minari:"
-# What a copy's metadata say by themselves
+# Metadata that each dataset has of its own: a copy does not take them over.
 OF_THE_COPY = {
     "dataset_id",
     "observation_space",
@@ -46,49 +44,64 @@ LABELS = "episode_metadata"
 EXACT = {"rewards": "exact.rewards", "actions": "exact.actions"}
 
 
-def dataset_folder(source: str | os.PathLike) -> Path:
+def dataset_folder(name: str) -> Path:
     """
-    :param source: ``minari:(namespace/)name-vN``
-    :return: where Minari keeps it (or would): under ``MINARI_DATASETS_PATH``, or ``~/.minari/datasets``
+    :param name: (namespace/)name-vN
+    :return: the folder in which Minari keeps the dataset, or would keep it: under ``MINARI_DATASETS_PATH``, or
+        ``~/.minari/datasets``
     """
-    try:
-        from minari.dataset.minari_dataset import parse_dataset_id
-        from minari.storage.datasets_root_dir import get_dataset_path
-    except ModuleNotFoundError as error:
-        message = f'{source} needs the package minari; install it with: pip install "sb3-offline[minari]"'
-        raise ModuleNotFoundError(message, name=error.name) from error
-    name = os.fspath(source).removeprefix(PREFIX)
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
+
     try:
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:  # TypeError: a name without a version
-        raise DatasetError(source, "name", "is no id of a Minari dataset", f"Give {PREFIX}(namespace/)name-vN") from error
+        remedy = f"Give {PREFIX}(namespace/)name-vN"
+        raise DatasetError(PREFIX + name, "name", "is no ID of a Minari dataset", remedy) from error
     return Path(get_dataset_path(name)).absolute()
 
 
-def is_minari(path: Path) -> bool:
-    """:return: whether a folder holds a Minari dataset"""
-    return (path / "data" / "metadata.json").is_file()
-
-
-def read_minari(path: Path) -> tuple[Header, dict[str, Any]]:
+def recognizes(probe: Probe) -> bool:
     """
-    Read a Minari dataset into memory, as the arrays of our format.
+    :param probe: a path or an object
+    :return: whether it is the folder of a Minari dataset, the folder ``data`` inside of it, or the HDF5 file in that
+    """
+    return _data_folder(probe) is not None
 
-    :param path: the dataset's folder
-    :return: header and arrays by name, as ``Header.fields`` names them
+
+def _data_folder(probe: Probe) -> Path | None:
+    """:return: the folder of the metadata and the episodes, if it is a Minari dataset"""
+    if probe.kind == "folder":
+        if (probe.path / "data" / "metadata.json").is_file():
+            return probe.path / "data"
+        metadata = probe.json("metadata.json")
+        return probe.path if isinstance(metadata, dict) and "total_episodes" in metadata else None
+    is_inside = "episode_0" in probe.names and (probe.path.parent / "metadata.json").is_file()
+    return probe.path.parent if probe.kind == "HDF5" and is_inside else None
+
+
+def read(probe: Probe, options: Options) -> Foreign:
+    """
+    Read a Minari dataset into memory.
+
+    :param probe: the folder
+    :param options: none is needed, since Minari declares all of them
+    :return: the data
     """
     from minari import MinariDataset
 
+    path, folder = probe.path, _data_folder(probe) or probe.path
+    probe.close()
     try:
-        dataset = MinariDataset(path / "data")
-        metadata = dataset.storage.read_raw_metadata(path / "data")
+        dataset = MinariDataset(folder)
+        metadata = dataset.storage.read_raw_metadata(folder)
         ids = [int(index) for index in dataset.episode_indices]
         episodes = list(dataset.storage.get_episodes(ids))
         labels = [dict(label) for label in dataset.storage.get_episode_metadata(ids)]
     except (OSError, KeyError, ValueError, AssertionError, NotImplementedError) as error:
         raise DatasetError(path, "dataset", f"cannot be read by Minari ({error})", "Download or create it again") from error
     for space in (dataset.observation_space, dataset.action_space):
-        space_to_json(space)  # refuses what cannot be stored
+        space_to_json(space)  # raises if the space cannot be stored
     if not episodes:
         raise DatasetError(path, "total_episodes", "is 0", "Give a dataset with episodes")
     lengths = np.array([len(episode["rewards"]) for episode in episodes], dtype=np.int64)
@@ -137,15 +150,15 @@ def read_minari(path: Path) -> tuple[Header, dict[str, Any]]:
     fields = header.fields()
     for name, array in steps.items():
         arrays[name] = check_rows(array, fields[name].shape, fields[name].dtype, int(lengths.sum()), path, name)
-    return header, arrays
+    return Foreign(header, arrays)
 
 
 def _infos_as_extras(
     episodes: list[dict[str, Any]], lengths: np.ndarray, path: Path
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """
-    :return: extras by name, and what :func:`write_minari` needs to undo it: the keys of each, and whether there was a row
-        for the reset
+    :return: extras by name, and for each what :func:`write` needs to turn it into infos again: the keys, and whether there was
+        a row of the reset
     """
     leaves = [dict(_leaves(infos)) for infos in episodes]
     extras: dict[str, np.ndarray] = {}
@@ -156,7 +169,7 @@ def _infos_as_extras(
         texts = all(part.dtype == object and all(isinstance(row, bytes) for row in part.flat) for part in parts)
         same = len({(part.shape[1:], part.dtype) for part in parts}) == 1
         if resets not in ({0}, {1}) or not same or not (texts or parts[0].dtype.kind in "biufS"):
-            problem = "is not in every episode, with a number, a text or an array of one shape for each step"
+            problem = "does not have a number, a text or an array of one shape for each step of every episode"
             warnings.warn(f"{path}: infos/{'/'.join(keys)}: {problem}; it is left out.")
             continue
         name, has_reset = ".".join(keys), resets == {1}
@@ -183,7 +196,7 @@ def _leaves(infos: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tupl
 
 
 def _labels(labels: list[dict[str, Any]], starts: np.ndarray, n_steps: int) -> np.ndarray | None:
-    """:return: (n_steps,) metadata of the episodes that have no arrays of their own, as JSON in first steps"""
+    """:return: (n_steps,) those metadata of episodes for which there are no other arrays, as JSON in first steps"""
     others = [{k: v for k, v in label.items() if k not in ("id", "seed", "total_steps", "source")} for label in labels]
     if not any(others):
         return None
@@ -193,51 +206,33 @@ def _labels(labels: list[dict[str, Any]], starts: np.ndarray, n_steps: int) -> n
     return rows
 
 
-def write_minari(dataset: "OfflineDataset", destination: str) -> None:
+def write(header: Header, arrays: Mapping[str, Any], name: str) -> None:
     """
-    Write a dataset as a Minari dataset, whole or not at all. Images are stored raw, not as JPEG, which would change them.
+    Write a Minari dataset, completely or not at all. Images are stored raw, since JPEG would change them.
 
-    :param dataset: any dataset
-    :param destination: ``minari:(namespace/)name-vN``; there must be none of that name
+    :param header: of the dataset
+    :param arrays: by name, as ``Header.fields`` names them
+    :param name: ``minari:(namespace/)name-vN``; there must be no dataset of that name
     """
-    folder = dataset_folder(destination)
+    name = name.removeprefix(PREFIX)
+    folder = dataset_folder(name)
     if folder.exists():
-        remedy = f"Give another name or version, or delete it (minari delete {destination.removeprefix(PREFIX)})"
+        remedy = f"Give another name or version, or delete it (minari delete {name})"
         raise DatasetError(folder, "dataset", "exists already", remedy)
     import minari
 
-    metadata = dict(dataset.provenance.get("minari", {}).get("metadata", {}))
-    for name in ("author", "author_email"):
-        if name in metadata:
-            metadata[name] = set(metadata[name])
-    header = dataset.header
-    if "env_spec" not in metadata and header.env_id in gym.registry:
-        spec = gym.spec(header.env_id)
-        spec.kwargs.update(header.env_kwargs)
-        metadata["env_spec"] = spec.to_json()
-    metadata["sb3_offline"] = {
-        "env_id": header.env_id,
-        "env_kwargs": header.env_kwargs,
-        "provenance": {name: value for name, value in dataset.provenance.items() if name != "minari"},
-        "sources": header.sources,
-        "rewards": header.rewards,
-    }
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an author and the like that nobody named
+            warnings.simplefilter("ignore", UserWarning)  # Minari warns about a missing author and the like
             written = minari.create_dataset_from_buffers(
-                destination.removeprefix(PREFIX),
-                _episodes(dataset),  # type: ignore[arg-type]
-                observation_space=dataset.observation_space,
-                action_space=dataset.action_space,
+                name,
+                _episodes(header, arrays),  # type: ignore[arg-type]
+                observation_space=header.observation_space,
+                action_space=header.action_space,
                 jpeg_encoding=False,
             )
-        written.storage.update_metadata(metadata)
-        labels: list[dict[str, Any]] = [{} for _ in range(dataset.n_episodes)]
-        if LABELS in dataset.extras:
-            labels = [json.loads(dataset.extras[LABELS][start]) for start in dataset.step_starts]
-        if dataset.source is not None:
-            labels = [{**label, "source": dataset.sources[index]} for label, index in zip(labels, dataset.source, strict=True)]
+        written.storage.update_metadata(_metadata(header))
+        labels = _episode_metadata(header, arrays)
         if any(labels):
             written.storage.update_episode_metadata(
                 [{"/".join(keys): value for keys, value in _leaves(label)} for label in labels]
@@ -247,21 +242,55 @@ def write_minari(dataset: "OfflineDataset", destination: str) -> None:
         raise
 
 
-def _episodes(dataset: "OfflineDataset") -> Iterator[Any]:
+def _metadata(header: Header) -> dict[str, Any]:
+    """:return: metadata of the dataset: those that it was read with, and what Minari has no place for"""
+    metadata = dict(header.provenance.get("minari", {}).get("metadata", {}))
+    for name in ("author", "author_email"):
+        if name in metadata:
+            metadata[name] = set(metadata[name])
+    if "env_spec" not in metadata and header.env_id in gym.registry:
+        spec = gym.spec(header.env_id)
+        spec.kwargs.update(header.env_kwargs)
+        metadata["env_spec"] = spec.to_json()
+    metadata["sb3_offline"] = {
+        "env_id": header.env_id,
+        "env_kwargs": header.env_kwargs,
+        "provenance": {name: value for name, value in header.provenance.items() if name != "minari"},
+        "sources": header.sources,
+        "rewards": header.rewards,
+    }
+    return metadata
+
+
+def _episode_metadata(header: Header, arrays: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """:return: metadata of each episode: those that it was read with, and the label of its source"""
+    lengths = np.asarray(arrays["episodes/length"])
+    labels: list[dict[str, Any]] = [{} for _ in lengths]
+    if LABELS in header.extras:
+        labels = [json.loads(arrays[f"extras/{LABELS}"][start]) for start in np.cumsum(lengths) - lengths]
+    if header.sources is not None:
+        indices = np.asarray(arrays["episodes/source"])
+        labels = [{**label, "source": header.sources[index]} for label, index in zip(labels, indices, strict=True)]
+    return labels
+
+
+def _episodes(header: Header, arrays: Mapping[str, Any]) -> Iterator[Any]:
     """:return: Minari's buffers, one episode after another"""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
-    undo = dataset.provenance.get("minari", {}).get("infos", {})
-    per_step = {name: array for name, array in dataset.extras.items() if name not in (LABELS, *EXACT.values())}
-    if dataset.success is not None:
-        per_step["success"] = dataset.success
+    undo = header.provenance.get("minari", {}).get("infos", {})
+    per_step = {name: arrays[f"extras/{name}"] for name in header.extras if name not in (LABELS, *EXACT.values())}
+    if header.success:
+        per_step["success"] = arrays["success"]
     resets = {name: per_step.pop(f"reset.{name}") for name in list(per_step) if f"reset.{name}" in per_step}
-    is_dict = isinstance(dataset.observation_space, spaces.Dict)
-    for episode in range(dataset.n_episodes):
-        n, first, first_row = dataset.lengths[episode], dataset.step_starts[episode], dataset.observation_starts[episode]
+    exact = {name: f"extras/{EXACT[name]}" if EXACT[name] in header.extras else name for name in EXACT}
+    is_dict = isinstance(header.observation_space, spaces.Dict)
+    lengths, seeds = np.asarray(arrays["episodes/length"]), np.asarray(arrays["episodes/seed"])
+    first_steps = np.cumsum(lengths) - lengths
+    for episode, (n, seed, first) in enumerate(zip(lengths, seeds, first_steps, strict=True)):
 
         def rows(name: str, first: int = first, n: int = n) -> np.ndarray:
-            return dataset.arrays[name][first : first + n]
+            return arrays[name][first : first + n]
 
         infos: dict[str, Any] = {}
         for name, array in per_step.items():
@@ -274,18 +303,29 @@ def _episodes(dataset: "OfflineDataset") -> Iterator[Any]:
             for key in how["keys"][:-1]:
                 leaf = leaf.setdefault(key, {})
             leaf[how["keys"][-1]] = [text.decode() for text in values] if values.dtype.kind == "S" else values
-        exact = {name: f"extras/{EXACT[name]}" if EXACT[name] in dataset.extras else name for name in EXACT}
         observations = {
-            name.removeprefix("observations/"): dataset.arrays[name][first_row : first_row + n + 1]
-            for name in subspaces(dataset.observation_space, "observations")
+            name.removeprefix("observations/"): rows(name, first + episode, n + 1)
+            for name in subspaces(header.observation_space, "observations")
         }
         yield EpisodeBuffer(
             id=episode,
-            seed=None if dataset.seeds[episode] == -1 else int(dataset.seeds[episode]),
+            seed=None if seed == -1 else int(seed),
             observations=observations if is_dict else observations["observations"],
             actions=rows(exact["actions"]),
-            rewards=rows(exact["rewards"]) if dataset.rewards is not None else np.zeros(n, np.float32),  # type: ignore[arg-type]
+            rewards=rows(exact["rewards"]) if header.rewards else np.zeros(n, np.float32),  # type: ignore[arg-type]
             terminations=rows("terminated"),  # type: ignore[arg-type]
             truncations=rows("truncated"),  # type: ignore[arg-type]
             infos=infos or None,
         )
+
+
+FORMAT = Format(
+    name="Minari",
+    description=f"{PREFIX}namespace/name-v0, or a folder with data/metadata.json",
+    recognizes=recognizes,
+    read=read,
+    declares_spaces=True,
+    extra="minari",
+    scheme=Scheme(PREFIX, dataset_folder, pattern=r"([\w-]+/)*[\w-]+-v\d+", download="minari download {name}"),
+    write=write,
+)

@@ -1,4 +1,4 @@
-"""Flat transitions of other libraries, cut into the episodes of our format; spaces where a source declares none."""
+"""Tools for several formats: flat transitions are cut into episodes, and spaces that are not declared are guessed."""
 
 import os
 from collections.abc import Mapping
@@ -23,20 +23,22 @@ def cut_episodes(
     steps: Mapping[str, np.ndarray],
 ) -> dict[str, Any]:
     """
-    Cut n transitions, in their order, into episodes.
+    Cut n transitions into episodes, in their order.
 
-    Where the observation after an episode's last step is not known, a terminated episode repeats its last observation there:
-    learners that stop at ``terminated`` never use it, but to those that ignore it, as learners from success examples do, the
-    last step seems to change nothing. Any other episode ends one step earlier instead.
+    Where the observation after the last step of an episode is unknown, it depends on how the episode ends. A terminated
+    episode repeats the observation before the last step. Learners that stop at ``terminated`` never use the repeated
+    observation; to learners that do not stop there, such as learners from success examples, the last step seems to change
+    nothing. Any other episode ends one step earlier instead.
 
     :param header: spaces and optional arrays
-    :param path: for error messages
+    :param path: file for error messages
     :param observations: (n, ...) by array name, ``observations`` or ``observations/key``
-    :param next_observations: likewise; looked at in last steps alone
-    :param known: (n,) bool, whether ``next_observations`` hold what followed the step
-    :param ends: (n,) bool, whether a step is the last one of its episode
-    :param steps: all other arrays with one row per step; ``terminated`` and ``truncated`` are looked at in last steps alone
+    :param next_observations: (n, ...) by array name, the observations after the steps. Only last steps count
+    :param known: (n,) bool, true if ``next_observations`` has the observation after the step
+    :param ends: (n,) bool, true in the last step of each episode
+    :param steps: all other arrays with one row for each step. Of ``terminated`` and ``truncated``, only last steps count
     :return: arrays by name, as ``Header.fields`` names them
+    :raises DatasetError: if an array does not fit its space
     """
     last = np.flatnonzero(ends)
     first = np.append(0, last[:-1] + 1)
@@ -45,8 +47,9 @@ def cut_episodes(
     first, last, lost = first[kept], last[kept], lost[kept]
     lengths = last + 1 - first - lost
     step_rows, observation_rows = _ranges(first, lengths), _ranges(first, lengths + 1)
-    final = np.cumsum(lengths + 1) - 1  # where the last observation of each episode goes
-    observation_rows[final] -= ~lost  # the observation of a lost step is the last one; without it there is none after `last`
+    final = np.cumsum(lengths + 1) - 1  # rows of the last observations of the episodes
+    # The observation before a lost step becomes the last one of its episode. Other episodes have no row after `last`.
+    observation_rows[final] -= ~lost
     arrays: dict[str, Any] = {"episodes/length": lengths, "episodes/seed": np.full(len(lengths), -1, dtype=np.int64)}
     cut = {name: array[observation_rows] for name, array in observations.items()}
     for name, array in (next_observations or {}).items():
@@ -65,8 +68,8 @@ def cut_episodes(
 def follows(observations: Mapping[str, np.ndarray], following: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     :param observations: (n, ...) by array name
-    :param following: what followed each step, likewise
-    :return: (n,) whether that is the next row's observation; false in the last row
+    :param following: (n, ...) by array name, the observations after the steps
+    :return: (n,) bool, true if the observation after the step is that of the next row; false in the last row
     """
     same = np.ones(len(next(iter(observations.values()))), dtype=bool)
     same[-1] = False
@@ -77,8 +80,8 @@ def follows(observations: Mapping[str, np.ndarray], following: Mapping[str, np.n
 
 def lengths_so_far(ends: np.ndarray) -> np.ndarray:
     """
-    :param ends: (n,) whether a step is the last one of its episode
-    :return: (n,) number of steps of the episode up to and with each row
+    :param ends: (n,) bool, true in the last step of each episode
+    :return: (n,) number of steps from the beginning of the episode up to and including each step
     """
     index = np.arange(len(ends))
     starts = np.maximum.accumulate(np.where(np.append(True, ends[:-1]), index, 0))
@@ -89,8 +92,9 @@ def checked_observations(arrays: Mapping[str, np.ndarray], space: spaces.Space, 
     """
     :param arrays: observations by array name, ``observations`` or ``observations/key``
     :param space: their space
-    :param path: for error messages
-    :return: these arrays with the dtypes of the space; raises ``DatasetError`` where they do not fit it
+    :param path: file for error messages
+    :return: these arrays with the dtypes of the space
+    :raises DatasetError: if they do not fit the space
     """
     value: Any = arrays["observations"] if "observations" in arrays else None
     if isinstance(space, spaces.Dict):
@@ -106,8 +110,8 @@ def _ranges(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 def guess_observation_space(observations: np.ndarray) -> spaces.Box:
     """
-    :param observations: (n, ...) of a source that declares no space
-    :return: 0 to 255 for uint8, unbounded for anything else
+    :param observations: (n, ...) observations without a declared space
+    :return: a Box of their shape: 0 to 255 for uint8, unbounded for other dtypes
     """
     if observations.dtype == np.uint8:
         return spaces.Box(0, 255, observations.shape[1:], np.uint8)
@@ -116,15 +120,16 @@ def guess_observation_space(observations: np.ndarray) -> spaces.Box:
 
 def guess_action_space(actions: np.ndarray, path: str | os.PathLike) -> spaces.Box:
     """
-    :param actions: (n, ...) of a source that declares no space
-    :param path: for error messages
-    :return: [-1, 1]; raises ``DatasetError`` where the actions are integers or larger
+    :param actions: (n, ...) actions without a declared space
+    :param path: file for error messages
+    :return: a Box of their shape with the bounds [-1, 1]
+    :raises DatasetError: if the actions are integers, or if they exceed these bounds
     """
     remedy = "Open it with OfflineDataset(path, action_space=...), or convert it with --env ID"
     if actions.dtype.kind != "f":
-        problem = f"has dtype {actions.dtype}, and a file of this kind does not say which actions there are"
+        problem = f"has dtype {actions.dtype}, and data of this format do not declare which actions there are"
         raise DatasetError(path, "actions", problem, remedy)
     if np.abs(actions).max() > 1 + 1e-5:
-        problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and a file of this kind declares no bounds"
+        problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and data of this format declare no bounds"
         raise DatasetError(path, "actions", problem, remedy)
     return spaces.Box(-1.0, 1.0, actions.shape[1:], np.float32)
