@@ -47,10 +47,17 @@ def test_what_is_written_is_read(tmp_path, space, capacity):
     assert os.listdir(tmp_path) == ["d.h5"]
 
 
+def n_written(acknowledged):
+    raw = acknowledged.read_bytes()
+    return struct.unpack("q", raw)[0] if raw else 0
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGKILL")
-def test_killed_at_random_moments_every_acknowledged_episode_is_there(tmp_path):
+def test_killed_at_random_moments_every_acknowledged_episode_is_there(tmp_path, monkeypatch):
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["data_files"])  # or every process would import everything again
+    # The server imports everything once for all processes. It finds this folder by the environment only.
+    monkeypatch.setenv("PYTHONPATH", os.path.dirname(__file__), prepend=os.pathsep)
+    context.set_forkserver_preload(["data_files"])
     path, acknowledged = tmp_path / "d.h5", tmp_path / "acknowledged"
     rng = np.random.default_rng(0)
     n_before, kills_while_writing = 0, 0
@@ -58,14 +65,14 @@ def test_killed_at_random_moments_every_acknowledged_episode_is_there(tmp_path):
         acknowledged.unlink(missing_ok=True)
         process = context.Process(target=data_files.write_until_killed, args=(path, acknowledged))
         process.start()
-        while not acknowledged.exists():
-            time.sleep(0.001)
-        time.sleep(rng.uniform(0, 0.08))
+        wanted = n_before + int(rng.integers(0, 4))
+        while not acknowledged.exists() or (wanted > n_before and n_written(acknowledged) < wanted):
+            time.sleep(0.0002)
+        time.sleep(rng.uniform(0, 0.01))
         process.kill()
         process.join()
         assert process.exitcode == -9
-        raw = acknowledged.read_bytes()
-        n_acknowledged = struct.unpack("q", raw)[0] if raw else n_before
+        n_acknowledged = n_written(acknowledged) or n_before
         if not path.exists():
             assert n_acknowledged == 0
             continue
