@@ -5,8 +5,6 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-import sb3_offline
-
 SIMULATION_PACKAGES = ("metaworld", "mujoco", "gymnasium", "numpy")
 """The packages that decide what happens in an episode."""
 TRAINING_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "metaworld", "mujoco")
@@ -17,7 +15,7 @@ def current_commit() -> str:
     """
     :return: the commit of this code, with a + if the code differs from it; "unknown" outside a repository
     """
-    root = Path(sb3_offline.__file__).parent.parent
+    root = Path(__file__).parents[2]
     code = ["sb3_offline", "zoo_configs", "data_tools"]
 
     def git(*arguments: str) -> str:
