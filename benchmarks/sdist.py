@@ -1,4 +1,4 @@
-"""Source distributions of other projects, whose data and tests are not in their wheels."""
+"""Download source distributions of other projects, for data and tests that are not in their wheels."""
 
 import os
 import subprocess
@@ -9,16 +9,18 @@ from pathlib import Path
 
 def fetch(package: str, version: str, folder: Path) -> Path:
     """
+    Download and unpack a source distribution, unless it is in the folder already.
+
     :param package: name on PyPI
-    :param version: exact
-    :param folder: to download and unpack into, where it is not there yet
-    :return: the unpacked source distribution
+    :param version: exact version
+    :param folder: folder for the distribution
+    :return: folder of the unpacked source distribution
     """
     root = folder / f"{package}-{version}"
     if not root.exists():
         folder.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, "-m", "pip", "download", f"{package}=={version}", "--no-deps", "--no-binary", package]
-        # pip asks even a package that it only downloads for its version, and some take that from git
+        # pip builds the metadata even of a package that it only downloads, and some packages take their version from git
         names = (f"{tool}_PRETEND_VERSION_FOR_{package.upper()}" for tool in ("SETUPTOOLS_SCM", "VCS_VERSIONING"))
         environment = {**os.environ, **dict.fromkeys(names, version)}
         subprocess.run([*command, "--quiet", "--dest", str(folder)], check=True, env=environment)

@@ -1,11 +1,12 @@
 """
-Whether a change made steps faster: another checkout of this library and this one, in turn in one process, with one thread.
+Compare the speed of training steps in another checkout of this library and in this one. Both run in turn, in one process of
+one thread.
 
     git worktree add /tmp/before HEAD~5
     python benchmarks/versions.py /tmp/before ceborl ceborl_bf16 cql_bf16 in_sample_bf16
 
-Takes the processor time of the thread, which other processes on the machine disturb less than the time on the clock, and
-prints the median of before / after over pairs of a few steps each, with its quartiles. `in_sample` is CEBORL with beta = 0.
+The program measures the processor time of the thread, which depends less on other processes than wall time does. It prints the
+median and the quartiles of the ratio before / after, over pairs of a few steps each. `in_sample` is CEBORL with beta = 0.
 """
 
 import argparse
@@ -23,7 +24,10 @@ STEPS = {"states": 4, "pixels": 1}
 
 
 def load(checkout: Path) -> ModuleType:
-    """:return: ``throughput.py`` beside this file, on the library in that checkout"""
+    """
+    :param checkout: folder of a checkout
+    :return: the module ``throughput.py`` in this folder, imported with the library of that checkout
+    """
     for name in [name for name in sys.modules if name.split(".")[0] in ("sb3_offline", "throughput")]:
         del sys.modules[name]
     sys.path.insert(0, str(checkout.resolve()))
@@ -34,7 +38,13 @@ def load(checkout: Path) -> ModuleType:
 
 
 def milliseconds(model: object, steps: int, batch_size: int) -> float:
-    model.train(1, batch_size)  # type: ignore[attr-defined]  (what the model before left in the caches is not counted)
+    """
+    :param model: a model
+    :param steps: number of gradient steps to time
+    :param batch_size: batch size
+    :return: processor time of a step
+    """
+    model.train(1, batch_size)  # type: ignore[attr-defined]  (a first step, without timing, fills the caches)
     began = time.thread_time()
     for _ in range(steps):
         model.train(1, batch_size)  # type: ignore[attr-defined]
@@ -43,11 +53,13 @@ def milliseconds(model: object, steps: int, batch_size: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("before", type=Path, help="the other checkout")
-    parser.add_argument("learners", nargs="+", help="names of algorithms, with _bf16 at the end for bfloat16")
+    parser.add_argument("before", type=Path, help="folder of the other checkout")
+    parser.add_argument("learners", nargs="+", help="names of algorithms, with the suffix _bf16 for bfloat16")
     parser.add_argument("--kind", choices=STEPS, default="states")
     parser.add_argument("--pairs", type=int, default=20)
-    parser.add_argument("--batch-size", type=int, default=256, help="transitions, and examples, in a batch")
+    parser.add_argument(
+        "--batch-size", type=int, default=256, help="number of transitions in a batch, and of examples (default: 256)"
+    )
     args = parser.parse_args()
     th.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""collect-sac: the same episodes for any number of workers, shards and restarts."""
+"""collect-sac gives the same episodes for any number of workers, shards and restarts."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The command line on real, small data: what the README promises, in seconds instead of minutes."""
+"""The demo and the command line on small real data."""
 
 import csv
 import inspect
@@ -39,7 +39,7 @@ def demo(tmp_path_factory):
     return folder, run_demo(folder, TINY)
 
 
-def test_demo_leaves_all_it_promises(demo):
+def test_demo_leaves_all_its_files(demo):
     folder, report = demo
     with (folder / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -93,7 +93,7 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     for wrong, message in ((["--env", "Pendulum-v1"], "do not fit"), (["--hyperparams", "weight_max:0"], "weight_max is 0")):
         with pytest.raises(SystemExit, match=message):
             cli.main([*train, "--eval-freq", "1", "-o", run, *wrong])
-    assert files() == before  # a run stays until the data, the numbers and the environment of the next one are found good
+    assert files() == before  # a run stays until the data, the settings and the environment of the next one have been checked
     config = tmp_path / "run/config.yml"
     config.write_text(config.read_text().replace("env: MultimodalMetaworld-v0", "env: Gone-v0"))
     with pytest.raises(SystemExit, match="Gone"):

@@ -1,4 +1,4 @@
-"""A model that goes on: with other data, another seed, a saved buffer, another environment."""
+"""A saved model continues: with other data, another seed, a saved buffer or another environment."""
 
 import h5py
 import numpy as np
@@ -17,7 +17,7 @@ SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "
 
 @pytest.fixture
 def paths(tmp_path):
-    """Two datasets of as many steps, with other actions and rewards."""
+    """Two datasets of the same length, with different actions and rewards."""
     for name in ("a", "b"):
         write_dataset(tmp_path / f"{name}.h5", 6, STATES)
     with h5py.File(tmp_path / "b.h5", "r+") as file:
@@ -49,7 +49,7 @@ def test_a_saved_buffer_brings_its_place_and_no_other_data(paths, tmp_path):
     assert set(np.unique(relabelled.replay_buffer.rewards)) == {0, 1}
     bare = CQL("MlpPolicy", ForbiddenEnv(STATES), **SMALL, n_steps=3)
     bare.load_replay_buffer(tmp_path / "buffer")
-    assert bare.learn(1).policy.standardizes  # of a buffer of 1-step transitions
+    assert bare.learn(1).policy.standardizes  # the loaded buffer has 1-step transitions
 
 
 def test_kept_transitions_are_those_of_the_dataset(paths, tmp_path):
@@ -94,7 +94,7 @@ def test_another_normaliser_counts_for_all_that_is_learned_from(paths, tmp_path)
         env = VecNormalize(DummyVecEnv([lambda: ForbiddenEnv(STATES, allowed=True)]), norm_obs=mean is not None)
         if mean is not None:
             env.obs_rms.mean[:] = mean
-        env.training = mean is None  # or its statistics would be the dataset's
+        env.training = mean is None  # otherwise its statistics would become those of the dataset
         return env
 
     model = CQL("MlpPolicy", None, paths[0], **SMALL).learn(1)

@@ -1,4 +1,4 @@
-"""A grid of runs. Its table is the same whether or not processes are killed."""
+"""A grid of runs has the same table whether or not processes are killed."""
 
 import csv
 import json
@@ -46,7 +46,7 @@ def run_benchmark(folder, grid, *options):
 
 
 def kill_once(run, file, n_lines, done):
-    """Kill the process of a run as soon as a file of it has so many lines."""
+    """Kill the process of a run as soon as one of its files has this number of lines."""
     while not done.is_set():
         path = run.folder / file
         if path.exists() and path.read_bytes().count(b"\n") >= n_lines:
@@ -56,7 +56,7 @@ def kill_once(run, file, n_lines, done):
     raise AssertionError(f"{run.label} was not killed")
 
 
-def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
+def test_killed_runs_end_like_others(data, tmp_path):
     grid = load_grid(write_grid(tmp_path, data, n_timesteps=200))
     chosen = grid.cells(["ceborl", "cql"], ["door-open"])
     whole, killed = (plan(grid, tmp_path / name, chosen) for name in ("whole", "killed"))
@@ -65,7 +65,7 @@ def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
     ceborl, cql = killed.values()
     done = threading.Event()
     with ThreadPoolExecutor() as pool:
-        # One after its first save, the other after its first evaluation, perhaps before it saved that step
+        # One is killed after its first save, the other after its first evaluation, perhaps before it saved that step
         kills = [pool.submit(kill_once, ceborl, RESUME_FILE, 0, done), pool.submit(kill_once, cql, TABLE, 2, done)]
         assert len(list(train_locally([ceborl, cql], n_workers=2))) == 2
         done.set()
@@ -78,7 +78,7 @@ def test_runs_that_were_killed_end_as_if_they_were_not(data, tmp_path):
 
 
 class _Interruption(BaseCallback):
-    """Stops a run at a step, or notes where it begins."""
+    """Stops a run at a step, and records the step where it began."""
 
     def __init__(self, step):
         super().__init__()
@@ -134,9 +134,9 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     before = model.stat().st_mtime_ns
     again = run_benchmark(tmp_path, grid, *options)
     for row in [*rows, *again]:
-        del row["commit"]  # the failed run was tried again, perhaps on another one
+        del row["commit"]  # the failed run was tried again, perhaps at another commit
     assert again == rows and model.stat().st_mtime_ns == before
-    # A part of the grid leaves the rows of the others, also among all evaluations
+    # Writing a part of the grid keeps the rows of the other cells, in both files
     curves = (tmp_path / "table_curves.csv").read_text()
     assert [line.split(",")[:4] for line in curves.splitlines()[1:]] == [
         [name, "door-open", "3", step] for name in ("bc", "ceborl") for step in ("10", "20", "30", "40")
@@ -145,13 +145,13 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     for row in part:
         del row["commit"]
     assert part == rows and (tmp_path / "table_curves.csv").read_text() == curves
-    # Other hyperparameters are another run: the table has it when it is there
+    # Other hyperparameters make another run, which the table shows once it is finished
     methods["ceborl"] = {**methods["ceborl"], "changes": {"batch_size": 5}}
     grid = write_grid(tmp_path, data, methods=methods)
     assert [row["method"] for row in run_benchmark(tmp_path, grid, "--no-training", *options)] == ["bc"] * 2 + ["wrong"] * 2
 
 
-def test_what_no_task_decides_is_trained_once(data, tmp_path, capsys):
+def test_a_run_that_no_task_affects_is_trained_once(data, tmp_path, capsys):
     grid = write_grid(tmp_path, data)
     rows = run_benchmark(tmp_path, grid, "--methods", "bc")
     assert "of 4 episodes solved" in capsys.readouterr().out  # two tasks, two checkpoints that count
@@ -170,7 +170,7 @@ def test_what_no_task_decides_is_trained_once(data, tmp_path, capsys):
     model, _ = load_run(tmp_path / "runs/bc/seed3/model.zip")
     observations = np.random.default_rng(0).normal(size=(5, *model.observation_space.shape)).astype(np.float32)
     actions, of_small = (player.predict(observations, deterministic=True)[0] for player in (model, policy))
-    np.testing.assert_allclose(of_small, actions, atol=0.05)  # its weights are rounded
+    np.testing.assert_allclose(of_small, actions, atol=0.05)  # the weights of the small file are rounded
     assert config["env"] == GRID["env"] and small.stat().st_size < 100_000
 
 
@@ -179,7 +179,7 @@ def test_a_run_of_all_tasks_keeps_no_evaluation_of_an_earlier_one(data, tmp_path
         methods = {"bc": {"algo": "bc", "config": "bc", "changes": {"learning_rate": rate}}}
         run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods, tasks=tasks))
     rows = run_benchmark(tmp_path, write_grid(tmp_path, data, methods=methods), "--no-training")
-    assert rows == []  # for the other task it has to be trained again
+    assert rows == []  # because of the other task, it has to be trained again
 
 
 def test_parts_of_a_grid_share_the_run_of_all_tasks(data, tmp_path):
@@ -193,7 +193,7 @@ def test_parts_of_a_grid_share_the_run_of_all_tasks(data, tmp_path):
 
 
 def test_two_processes_write_one_table(data, tmp_path):
-    """Each of its own cells, though both began before the other wrote any."""
+    """Each writes its own cells, although both begin before the other has written any."""
     grid = load_grid(write_grid(tmp_path, data, methods={"bc": GRID["methods"]["bc"]}, seeds=[3, 4]))
     cells = [plan(grid, tmp_path / "runs", grid.cells(seeds=[seed])) for seed in grid.seeds]
     writers = [table_writer(tmp_path / "table.csv", grid, part) for part in cells]

@@ -20,7 +20,7 @@ RATES = {"ceborl": [8, 10, 9, 5, 10], "rce": [2, 3, 0, 1, 0], "mine": [0, 0, 0, 
 
 @pytest.fixture
 def table(tmp_path):
-    """Two seeds and two checkpoints; the second seed of RCE solves one more of dial-turn, and one of its runs broke off."""
+    """Two seeds and two checkpoints. The second seed of RCE solves dial-turn once more, and one of its runs broke off."""
     with (tmp_path / "table1_x.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(FIELDS)
@@ -43,7 +43,7 @@ def test_the_table_holds_ours_beside_the_papers(table):
     assert lines[3] == "| ceborl, paper | 3 x 50 | 0.75 | 0.93 | 0.00 | 0.56 | 0.93 | 0.63 |"
     assert " 0.25 (" in lines[4] and ", crashed |" in lines[4]
     part = Results("part", [row for row in read_results(table).rows if row["task"] != TASKS[0]])
-    assert comparison_table(part).splitlines()[3].endswith("| 0.93 |  |")  # the paper's mean is one of other tasks
+    assert comparison_table(part).splitlines()[3].endswith("| 0.93 |  |")  # the mean of the paper is over other tasks
 
 
 def test_the_papers_numbers_agree_with_its_means():
@@ -56,12 +56,12 @@ def test_aggregates_are_those_of_rliables_paper(table, monkeypatch):
     monkeypatch.setattr(aggregates, "REPETITIONS", 50)
     results = read_results(table)
     means = aggregates.interquartile_means(results)
-    middle = np.sort(np.repeat([0.8, 1.0, 0.9, 0.5, 1.0], 2))[2:8]  # two of ten are cut off on each side
+    middle = np.sort(np.repeat([0.8, 1.0, 0.9, 0.5, 1.0], 2))[2:8]  # two of ten runs are cut off on each side
     assert means["ceborl"].value == pytest.approx(middle.mean())
     better = aggregates.improvement_probabilities(results, "ceborl")
     assert better["rce"].value == 1.0 and better["mine"].value == pytest.approx(0.8)
     assert means["rce"].interval[0] < means["rce"].value < means["rce"].interval[1]
-    assert str(aggregates.interquartile_means(results)["rce"]) == str(means["rce"])  # the same each time
+    assert str(aggregates.interquartile_means(results)["rce"]) == str(means["rce"])  # each time the same
 
 
 def test_one_command_makes_the_report(table, tmp_path, monkeypatch):

@@ -39,7 +39,9 @@ from sb3_offline.parallel.processes import map_in_order
 
 PAPER_SHARES = {"dial-turn": 0.33, "door-open": 0.31, "drawer-open": 0.28, "lever-pull": 0.35, "plate-slide": 0.33}
 """Share of successful episodes by task, as the CEBORL paper reports it for its data."""
-BEHAVIOUR = "stock SB3 SAC agents, trained for one task each from states, at several points of their training; sampled actions"
+SAC_BEHAVIOUR = (
+    "stock SB3 SAC agents, trained for one task each from states, at several points of their training; sampled actions"
+)
 # Recorded in the files. It stays when this module moves, because a file is continued only if its whole record is the same.
 PROGRAM = "sb3_offline.data_tools.collect_sac"
 HELD_OUT_STREAM = 1
@@ -172,7 +174,7 @@ def _provenance(collection: Collection, shard: int, n_shards: int) -> dict[str, 
     options = {name: value for name, value in asdict(collection).items() if name not in ("obs_type", "policies", "tasks")}
     return {
         "program": PROGRAM,
-        "policy": BEHAVIOUR,
+        "policy": SAC_BEHAVIOUR,
         **options,
         "shard": [shard, n_shards],
         "mix": mix,

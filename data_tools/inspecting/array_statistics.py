@@ -8,7 +8,7 @@ from sb3_offline.data.storage import RowStore
 from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
 
 SAMPLED_IMAGES = 256
-READ_BYTES = 1 << 25
+PIECE_BYTES = 1 << 25
 
 
 class ArrayStatistics(NamedTuple):
@@ -54,7 +54,7 @@ def _of_rows(array: RowStore) -> ArrayStatistics:
     if array.dtype.kind not in "biuf":  # text
         return ArrayStatistics(array, np.full(1, np.inf), np.full(1, -np.inf), 0)
     low, high, n_bad = np.full(columns, np.inf), np.full(columns, -np.inf), 0
-    rows = max(READ_BYTES // max(columns * array.dtype.itemsize, 1), 1)
+    rows = max(PIECE_BYTES // max(columns * array.dtype.itemsize, 1), 1)
     for first in range(0, len(array), rows):
         piece = array[first : first + rows].reshape(-1, columns)
         finite = np.isfinite(piece).all(axis=1)

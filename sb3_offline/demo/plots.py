@@ -15,7 +15,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 COLORS = {True: "#1b7f4b", False: "#b3402e"}
-N_FRAMES = 6
+FRAMES_PER_ATTEMPT = 6
 
 
 def plot_learning_curves(runs: dict[str, Path], path: Path) -> None:
@@ -47,9 +47,9 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Pat
     :param path: the PNG file
     """
     n_decisions = judged.odds.shape[1]
-    shown = np.linspace(0, n_decisions - 1, N_FRAMES).round().astype(int)
+    shown = np.linspace(0, n_decisions - 1, FRAMES_PER_ATTEMPT).round().astype(int)
     figure = plt.figure(figsize=(8, 6.4), layout="constrained")
-    grid = figure.add_gridspec(3, N_FRAMES, height_ratios=[2.4, 1, 1])
+    grid = figure.add_gridspec(3, FRAMES_PER_ATTEMPT, height_ratios=[2.4, 1, 1])
     axes = figure.add_subplot(grid[0, :])
     for index, solved in zip(pair, (True, False), strict=True):
         color, word = COLORS[solved], "successful" if solved else "failed"

@@ -14,7 +14,7 @@ from sb3_offline.experiment.recording import make_recording_env, record_episode
 from sb3_offline.experiment.training import load_run
 from sb3_offline.report.results import Results
 
-FRAME_SIZE = 160
+RECORDED_SIZE = 160
 """Width and height of the frames in pixels."""
 
 
@@ -84,7 +84,7 @@ def play(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any], seed:
     :param seed: seed of the episode
     :return: the episode
     """
-    env = make_recording_env(env_id, env_kwargs, FRAME_SIZE)
+    env = make_recording_env(env_id, env_kwargs, RECORDED_SIZE)
     watched = _Watched(model)
     try:
         frames, solved_at = record_episode(watched, env, seed)

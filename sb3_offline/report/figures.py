@@ -12,7 +12,7 @@ from sb3_offline.report.results import Results
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-N_FRAMES = 8
+FRAMES_PER_STRIP = 8
 OUTCOME_COLORS = {True: "#1b7f4b", False: "#b3402e"}
 
 
@@ -88,10 +88,10 @@ def plot_strips(episodes: Mapping[str, PlayedEpisode], title: str, path: Path) -
     :param title: title of the figure
     :param path: the image file
     """
-    size = (1.15 * N_FRAMES + 1.2, 1.32 * len(episodes) + 0.5)
-    figure, panels = plt.subplots(len(episodes), N_FRAMES, figsize=size, squeeze=False, layout="constrained")
+    size = (1.15 * FRAMES_PER_STRIP + 1.2, 1.32 * len(episodes) + 0.5)
+    figure, panels = plt.subplots(len(episodes), FRAMES_PER_STRIP, figsize=size, squeeze=False, layout="constrained")
     for (method, episode), row in zip(episodes.items(), panels, strict=True):
-        chosen = np.linspace(0, len(episode.frames) - 1, N_FRAMES).round().astype(int)
+        chosen = np.linspace(0, len(episode.frames) - 1, FRAMES_PER_STRIP).round().astype(int)
         for axes, decision in zip(row, chosen, strict=True):
             axes.imshow(episode.frames[decision])
             axes.set(xticks=[], yticks=[])
