@@ -2,13 +2,16 @@
 
 import csv
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from data_files import make_episode, write_dataset
 from gymnasium import spaces
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_algorithms import ACTIONS, POLICIES, files, make  # noqa: F401
 
 from sb3_offline import BC, CQL, IQL
@@ -17,6 +20,8 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.evaluation import OfflineEvalCallback, fitted_q_evaluation
 from sb3_offline.evaluation.metrics import auc, judge_probabilities, success_to_come
+from sb3_offline.experiment.evaluation import evaluate_success
+from sb3_offline.experiment.recording import record_episode
 
 CHAIN = spaces.Discrete(4)
 MOVES = spaces.Box(-1, 1, (1,), np.float32)
@@ -151,3 +156,50 @@ def test_data_without_rewards_cannot_be_evaluated_on(tmp_path):
         writer.add_episode(episode["observations"], episode["actions"])
     with pytest.raises(DatasetError, match="rewards: are missing, so a policy has no value"):
         fitted_q_evaluation(BC("MlpPolicy", None, str(tmp_path / "d.h5")), n_steps=1)
+
+
+class Far(gym.Env):
+    """One decision: right below 500, left above. Policies that learn from normalised observations fail on plain ones."""
+
+    observation_space, action_space = gym.spaces.Box(0, 1000, (1,)), gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(0, 1000)
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action):
+        good = bool((action[0] > 0) == (self.x < 500))
+        return np.array([self.x], np.float32), float(good), True, False, {"is_success": good}
+
+
+def test_what_was_learned_normalised_is_judged_normalised(tmp_path):
+    gym.register("TestFar-v0", Far)
+    rng = np.random.default_rng(0)
+    with DatasetWriter(tmp_path / "far.h5", Far.observation_space, Far.action_space, success=False) as writer:
+        for _ in range(20):
+            x = rng.uniform(0, 1000, (21, 1))
+            writer.add_episode(x, np.where(x[:-1] < 500, 0.8, -0.8), rewards=np.ones(20))
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(Far())]), norm_reward=False)
+    settings = {"seed": 0, "learning_rate": 3e-3, "policy_kwargs": {"net_arch": [32]}}
+    model = BC("MlpPolicy", env, str(tmp_path / "far.h5"), **settings).learn(400)
+    env.training = False
+    assert evaluate_policy(model, env, 50)[0] > 0.9
+    model.save(tmp_path / "model")
+    bare = BC.load(tmp_path / "model")  # without its environment: the statistics come with the model
+    for player in (model, bare):
+        assert evaluate_success(player, "TestFar-v0", {}, 50).success_rate > 0.9
+        frames = record_episode(player, Drawn(), seed=1)
+        assert frames[1] == 1
+        with pytest.raises(RuntimeError, match="VecNormalize"):
+            player.predict(np.array([700.0], np.float32))
+        plain = player.observation_normalizer().normalize_obs(np.array([[700.0], [300.0]]))
+        assert (player.predict(plain, deterministic=True)[0][:, 0] < 0).tolist() == [True, False]
+    assert evaluate_policy(bare, env, 50)[0] > 0.9  # as in SB3
+    with pytest.raises(RuntimeError, match="VecNormalize"):
+        fitted_q_evaluation(bare, model.replay_buffer, n_steps=1)
+
+
+class Drawn(Far):
+    def render(self):
+        return np.zeros((8, 8, 3), np.uint8)

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_offline.common.normalization import normalizes
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.reader import OfflineDataset, open_datasets
 
@@ -165,8 +166,3 @@ class LearningData:
         if saved.is_relabelled and not own.is_relabelled:
             own.rewards = saved.rewards
         return True
-
-
-def normalizes(normalizer: VecNormalize | None) -> bool:
-    """:return: whether an environment normalises observations"""
-    return normalizer is not None and normalizer.norm_obs

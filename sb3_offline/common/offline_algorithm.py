@@ -17,11 +17,12 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Pr
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_offline.common.augmentation import has_images, shift_observations
 from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, Constraints, check_parameters
 from sb3_offline.common.learning_data import LearningData
+from sb3_offline.common.normalization import NormalizerStatistics, exceeds_clipping, normalizer_from, normalizes, statistics_of
 from sb3_offline.common.process import prepare_process
 from sb3_offline.common.search import LEARNING, SearchSpace
 from sb3_offline.common.stub_env import SpacesOnlyEnv
@@ -133,6 +134,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._torch_rng_state: th.Tensor | None = None
         self._cuda_rng_state: th.Tensor | None = None
         self._observations_normalized = False  # by a VecNormalize, when it learned
+        self._saved_normalizer: NormalizerStatistics | None = None  # of that VecNormalize
         self._metrics: dict[str, tuple[th.Tensor, int]] = {}
 
     def _setup_model(self) -> None:
@@ -197,6 +199,46 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         super().set_env(env, force_reset)
         if self._vec_normalize_env is not normalizer:
             self._data.prepare_again()
+
+    def observation_normalizer(self) -> VecNormalize | None:
+        """
+        The statistics that the policy learned with. Whatever plays the policy in a plain environment has to normalise
+        observations by them before :meth:`predict`, as the environment did that the model learned with.
+
+        :return: a VecNormalize whose ``normalize_obs`` does this; ``None`` if the policy learned from plain observations.
+            Raises ``RuntimeError`` if the statistics are missing: the model was loaded from a zip of an earlier version
+            without its environment
+        """
+        normalizer = self._vec_normalize_env
+        if not self._observations_normalized:
+            return normalizer if normalizes(normalizer) else None
+        if normalizes(normalizer):
+            return normalizer
+        if self._saved_normalizer is None:
+            self._data.check_normalizer(normalizer)
+        assert self._saved_normalizer is not None
+        return normalizer_from(self._saved_normalizer, self.observation_space, self.action_space)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.predict`. As with all of SB3, a model that learned with a
+        ``VecNormalize`` takes observations that are normalised already. Plain ones are refused where they cannot be
+        normalised ones: ``RuntimeError`` for values outside the bounds that ``VecNormalize`` clips to.
+        """
+        if self._observations_normalized:
+            normalizer = self._vec_normalize_env if normalizes(self._vec_normalize_env) else self._saved_normalizer
+            if normalizer is not None and exceeds_clipping(observation, normalizer):
+                raise RuntimeError(
+                    "The policy learned from observations that a VecNormalize normalised, and these are not normalised; "
+                    "normalise them first: model.observation_normalizer().normalize_obs(observation)"
+                )
+        return super().predict(observation, state, episode_start, deterministic)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
@@ -388,6 +430,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         if self._data.buffer is not None:
             self._sampler_state = self._data.buffer.get_rng_state()
+        if normalizes(self._vec_normalize_env):
+            self._saved_normalizer = statistics_of(self._vec_normalize_env)  # type: ignore[arg-type]
         # With these, a loaded model goes on as this one would: PyTorch's generator of the device draws the actions.
         self._torch_rng_state = th.get_rng_state()
         self._cuda_rng_state = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None

@@ -38,7 +38,8 @@ def export_sac(
     Critics of rewards are kept. Those of learners from examples are no values of rewards: SAC gets new ones, on the same
     encoder. A deterministic actor gets a standard deviation of 0.1 before the tanh.
 
-    :param model: a trained actor-critic
+    :param model: a trained actor-critic. If it learned with a ``VecNormalize``, that one must be its environment, and SAC must
+        be loaded with it too: ``RuntimeError`` without it
     :param path: the zip to write
     :param data_ratio: share of each batch of SAC that comes from the model's dataset, which must have rewards; 0: none does
     :param buffer_size: see :class:`stable_baselines3.sac.SAC`
@@ -50,6 +51,7 @@ def export_sac(
     if not isinstance(model, ActorCriticAlgorithm):
         remedy = "export an actor-critic, such as CQL, IQL, TD3BC or CEBORL"
         raise TypeError(f"{type(model).__name__} has no critic that SAC could go on with; {remedy}")
+    model._data.check_normalizer(model._vec_normalize_env)
     if not 0 <= data_ratio <= 1:
         raise ValueError(f"data_ratio is {data_ratio}; give a share between 0 and 1")
     keeps_critic = isinstance(model, RewardBasedAlgorithm)

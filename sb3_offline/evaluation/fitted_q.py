@@ -45,6 +45,7 @@ def fitted_q_evaluation(
     :param seed: of weights, batches and sampled actions
     :return: (E,) the values of the episodes' first states; their mean estimates the policy's discounted return
     """
+    model._data.check_normalizer(model._vec_normalize_env)  # or the policy would see other observations than it learned from
     buffer = (model.replay_buffer if buffer is None else buffer).single_steps()
     if not buffer.has_rewards:
         remedy = "Evaluate on a dataset with rewards"

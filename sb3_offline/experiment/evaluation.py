@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 
 #: Seed of the first episode, far from the seeds of collected data.
 EVALUATION_SEED = 100_000
@@ -62,13 +65,42 @@ def make_evaluation_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> V
     return make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
 
 
+class PlainObservationPredictor:
+    """
+    A model that plays in plain environments: its observations are normalised as the model learned to see them.
+
+    :param model: a model, of this library or of SB3, or a policy, which is taken to see plain observations
+    """
+
+    def __init__(self, model: PolicyPredictor):
+        self.model = model
+        self._normalizer: VecNormalize | None = None
+        if isinstance(model, OfflineAlgorithm):
+            self._normalizer = model.observation_normalizer()
+        elif isinstance(model, BaseAlgorithm):
+            self._normalizer = model.get_vec_normalize_env()
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """See SB3's ``predict``; the observation is a plain one."""
+        if self._normalizer is not None:
+            observation = self._normalizer.normalize_obs(observation)
+        return self.model.predict(observation, state, episode_start, deterministic)
+
+
 def evaluate_success(
     model: PolicyPredictor, env_id: str, env_kwargs: dict[str, Any], n_episodes: int = 50, seed: int = EVALUATION_SEED
 ) -> Evaluation:
     """
     Play the mode of a policy. Each call creates the environment, so that the same seed gives the same episodes.
 
-    :param model: a model or a policy
+    :param model: a model or a policy. The observations of a model that learned with a ``VecNormalize`` are normalised by the
+        statistics that it learned with
     :param env_id: registered id of the environment, whose ``info`` must hold ``is_success``
     :param env_kwargs: keyword arguments of the environment
     :param n_episodes: number of episodes, at least one
@@ -77,6 +109,7 @@ def evaluate_success(
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes is {n_episodes}; play at least one")
+    player = PlainObservationPredictor(model)
     env = make_evaluation_env(env_id, env_kwargs, seed)
     successes: list[bool] = []
     solved = False
@@ -91,7 +124,9 @@ def evaluate_success(
             solved = False
 
     try:
-        returns, _ = evaluate_policy(model, env, n_episodes, deterministic=True, callback=at_step, return_episode_rewards=True)
+        returns, _ = evaluate_policy(
+            player, env, n_episodes, deterministic=True, callback=at_step, return_episode_rewards=True
+        )
     finally:
         env.close()
     return Evaluation(successes, list(returns))  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from sb3_offline.experiment.evaluation import EVALUATION_SEED
+from sb3_offline.experiment.evaluation import EVALUATION_SEED, PlainObservationPredictor
 
 FRAME_MS = 80
 LAST_FRAME_MS = 800
@@ -25,9 +25,10 @@ def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None
         ``None``
     """
     observation, _ = env.reset(seed=seed)
+    player = PlainObservationPredictor(model)
     frames, solved_at, solved_for, done = [env.render()], None, 0, False
     while not done and solved_for < 5:
-        action, _ = model.predict(observation, deterministic=True)
+        action, _ = player.predict(observation, deterministic=True)
         observation, _, terminated, truncated, info = env.step(action)
         frames.append(env.render())
         done = terminated or truncated

@@ -46,9 +46,12 @@ class _Watched:
     def __init__(self, model: OfflineAlgorithm):
         self.model = model
         self.values: list[float] = []
+        self._normalizer = model.observation_normalizer()
 
     @th.no_grad()
     def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        if self._normalizer is not None:
+            observation = self._normalizer.normalize_obs(observation)
         action, state = self.model.predict(observation, *args, **kwargs)
         if self.model.value_name is not None:
             tensors, _ = self.model.policy.obs_to_tensor(observation)
