@@ -28,6 +28,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_offline import ALGOS
+from sb3_offline.common.fast import operators
 from sb3_offline.common.process import prepare_process
 from sb3_offline.data.writer import DatasetWriter
 
@@ -157,12 +158,7 @@ def product_rate(mixed_precision: bool) -> float:
     """:return: operations a second of one large product"""
     dtype = th.bfloat16 if mixed_precision else th.float32
     left, right = th.randn(4096, 256).to(dtype), th.randn(256, 256).to(dtype)
-    product = (
-        (lambda: left @ right.t())
-        if mixed_precision
-        else (lambda: th.ops.mkldnn._linear_pointwise(left, right, None, "none", [], ""))
-    )
-    return 2 * left.numel() * 256 / _fastest(product)
+    return 2 * left.numel() * 256 / _fastest(lambda: operators.product(left, right))
 
 
 def copy_rate() -> float:
@@ -173,7 +169,8 @@ def copy_rate() -> float:
 
 def floor_entry(name: str, step: Step, median_ms: float, rate: float, copy_seconds: float) -> dict[str, Any]:
     """Operations of a step over the rate of a large product, and the time that copying the batch takes."""
-    with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
+    own = {operators._linear_pointwise: _linear_flop} if operators._linear_pointwise is not None else {}
+    with FlopCounterMode(display=False, custom_mapping=own) as counter:
         step()
     floor = 1e3 * (counter.get_total_flops() / rate + copy_seconds)
     return {

@@ -9,6 +9,7 @@ have a head for the value of a state without an action.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from sb3_offline.common.linear import has_fast_bfloat16, linear, run_layers
+from sb3_offline.common.fast import encode, linear_heads, mlp, state_action_values
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
 # Actions of a dataset often sit exactly on the bounds, where atanh is infinite.
@@ -54,7 +55,7 @@ class EncodingActor(BasePolicy):
             encoder is the critic's
         """
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
-            return _encode(self, obs)
+            return encode(partial(_features, self), obs, self.mixed_precision)
 
 
 class OfflineActor(EncodingActor, Actor):
@@ -75,8 +76,13 @@ class OfflineActor(EncodingActor, Actor):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "std_min": self.std_min}
 
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if deterministic:  # SB3's distribution gives the same, but checks its numbers, which cannot be exported.
+            return th.tanh(self.get_action_dist_params(obs)[0])
+        return super().forward(obs, deterministic)
+
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        # What plays is computed in full precision, whatever learning is.
+        # A policy that acts computes in float32, whatever it learned in.
         mean, log_std = self.gaussian_parameters(self.extract_features(obs, self.features_extractor))
         return mean, log_std, {}
 
@@ -86,9 +92,7 @@ class OfflineActor(EncodingActor, Actor):
         :return: mean and log standard deviation of the Gaussian before tanh, each ``(batch, action_dim)``
         """
         assert isinstance(self.mu, nn.Linear) and isinstance(self.log_std, nn.Linear)
-        weight = th.cat([self.mu.weight, self.log_std.weight])
-        last = weight, th.cat([self.mu.bias, self.log_std.bias])
-        mean, log_std = run_layers([*self.latent_pi, last], features).to(weight.dtype).chunk(2, dim=1)  # type: ignore[misc]
+        mean, log_std = linear_heads(self.latent_pi, (self.mu, self.log_std), features)
         return mean, th.clamp(log_std, self.log_std_min, LOG_STD_MAX)
 
     def sample(self, features: th.Tensor, n_samples: int | None = None) -> tuple[th.Tensor, th.Tensor]:
@@ -195,33 +199,17 @@ class OfflineCritic(ContinuousCritic):
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
         :return: features, ``(batch, features_dim)``, in the dtype that learning computes in
         """
-        return _encode(self, obs)
+        return encode(partial(_features, self), obs, self.mixed_precision)
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         Outputs of all critics, for one or for many actions per state.
 
-        The first layer is split into a product with the features, once a state, and one with the actions, once an action:
-        with K actions a state only their sum is K times as large.
-
         :param features: ``(batch, features_dim)``
         :param actions: ``(batch, action_dim)``, or ``(batch, K, action_dim)``, in [-1, 1]
         :return: ``(n_critics, batch)``, or ``(n_critics, batch, K)``
         """
-        actions = actions.to(features.dtype)
-        if actions.dim() == 2:
-            pairs = th.cat([features, actions], dim=1)
-            outputs = [run_layers(list(q_net), pairs).squeeze(1) for q_net in self.q_networks]  # type: ignore[call-overload]
-            return th.stack(outputs).to(self._parameter_dtype)
-        samples = actions.transpose(0, 1)  # (K, batch, .): what depends on states alone is added along whole rows
-        outputs = []
-        for q_net in self.q_networks:
-            assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
-            state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
-            of_state = linear(features, state_weight, q_net[0].bias)
-            values = run_layers([(action_weight, of_state), *list(q_net)[1:]], samples.flatten(0, 1))
-            outputs.append(values.view(samples.shape[:2]))
-        return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
+        return state_action_values(self.q_networks, features, actions)  # type: ignore[arg-type]
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
         """
@@ -230,27 +218,18 @@ class OfflineCritic(ContinuousCritic):
         """
         head = self.get_submodule("vf")
         assert isinstance(head, nn.Sequential)
-        return run_layers(list(head), features).squeeze(1).to(self._parameter_dtype)
-
-    @property
-    def _parameter_dtype(self) -> th.dtype:
-        return self.q_networks[0][-1].weight.dtype  # type: ignore
+        return mlp(head, features).squeeze(1)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
 
 
-def _encode(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
-    """Features of observations; all that is computed from them keeps their dtype, so it is chosen here."""
+def _features(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
+    """:return: features of observations as they are stored, ``(batch, features_dim)``"""
     encoder = module.features_extractor
-    device = (next(iter(obs.values())) if isinstance(obs, dict) else obs).device  # SB3's `module.device` walks through modules
-    bfloat16 = has_fast_bfloat16(device) if module.mixed_precision is None else module.mixed_precision
-    with th.autocast(device.type, th.bfloat16, enabled=bfloat16):
-        if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
-            features = encoder(obs)  # scales bytes by itself, which is cheaper than SB3's preprocessing
-        else:
-            features = module.extract_features(obs, encoder)
-    return features.bfloat16() if bfloat16 else features
+    if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
+        return encoder(obs)  # It scales uint8 images by itself, which is cheaper than SB3's preprocessing.
+    return module.extract_features(obs, encoder)
 
 
 class OfflinePolicy(SACPolicy):

@@ -6,9 +6,8 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from torch import nn
-from torch.nn import functional as F
 
-from sb3_offline.common.linear import run_layers
+from sb3_offline.common.fast import convolutions, mlp, prepare_convolutions
 
 
 class StandardizedExtractor(FlattenExtractor):
@@ -45,7 +44,7 @@ class StandardizedExtractor(FlattenExtractor):
         self.fitted.fill_(1.0)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return (super().forward(observations) - self.mean) / self.std
+        return (self.flatten(observations) - self.mean) / self.std
 
 
 class NormalizedNatureCNN(NatureCNN):
@@ -65,20 +64,13 @@ class NormalizedNatureCNN(NatureCNN):
     def __init__(self, observation_space: spaces.Box, features_dim: int = 512, normalized_image: bool = False):
         super().__init__(observation_space, features_dim, normalized_image)
         self.linear = nn.Sequential(self.linear[0], nn.LayerNorm(features_dim), nn.Tanh())
-        # The layout that batches of the datasets come in; convolutions are up to twice as fast in it.
-        self.cnn.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+        prepare_convolutions(self.cnn)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        images = observations.contiguous(memory_format=th.channels_last)
-        if images.dtype != th.uint8:
-            hidden = self.cnn(images)
-        else:  # the scale goes into the first layer's few weights instead of all pixels
-            first = self.cnn[0]
-            assert isinstance(first, nn.Conv2d)
-            device = images.device.type
-            dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else first.weight.dtype
-            hidden = self.cnn[1:](F.conv2d(images.to(dtype), first.weight / 255.0, first.bias, first.stride))
-        return run_layers(list(self.linear), hidden)
+        if th.jit.is_scripting():  # TorchScript compiles PyTorch's own modules only.
+            images = observations / 255.0 if observations.dtype == th.uint8 else observations
+            return self.linear(self.cnn(images))
+        return mlp(self.linear, convolutions(self.cnn, observations))
 
 
 class StandardizedCombinedExtractor(CombinedExtractor):

@@ -5,7 +5,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor
 
-from sb3_offline.common.linear import run_layers
+from sb3_offline.common.fast import mlp
 from sb3_offline.common.policies import EncodingActor, OfflinePolicy
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor
 
@@ -24,7 +24,7 @@ class DeterministicActor(EncodingActor, Actor):
         :return: actions in [-1, 1], ``(batch, action_dim)``
         """
         *layers, squash = self.mu
-        return squash(run_layers(layers, features).to(next(self.mu.parameters()).dtype))
+        return squash(mlp(layers, features))
 
     def forward(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
         return super().forward(obs)  # what plays is computed in full precision, whatever learning is
