@@ -13,14 +13,14 @@ from sb3_offline.common.fast.layers import linear
 from sb3_offline.common.policies import CnnPolicy, MlpPolicy
 from sb3_offline.td3_bc.policies import TD3BCPolicy
 
-# bfloat16 has 8 significant bits; a gradient adds thousands of such roundings up, of either sign.
+# Relative errors. bfloat16 has 8 significant bits, and a gradient sums thousands of such roundings.
 TOLERANCE = {th.float64: 1e-12, th.float32: 1e-4, th.bfloat16: 0.04}
 DTYPES = list(TOLERANCE)
 ACTIONS = spaces.Box(-1, 1, (4,), np.float32)
 
 
 def distance(actual: th.Tensor, expected: th.Tensor) -> float:
-    """:return: of two tensors, relative to the second"""
+    """:return: distance of two tensors, relative to the second"""
     return float((actual.detach().double() - expected.detach()).norm() / expected.detach().norm())
 
 
@@ -121,7 +121,7 @@ def test_columns_of_a_matrix(dtype):
 @pytest.mark.parametrize("mixed_precision", [False, True])
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_values_of_many_actions(mixed_precision, layer_norm):
-    """The split first layer gives what the whole network gives for every pair, and the same gradients."""
+    """Values and gradients are those of the network applied to each pair of state and action."""
     observation_space = spaces.Box(-1, 1, (9,), np.float32)
     policy = MlpPolicy(
         observation_space, ACTIONS, lambda _: 1e-3, mixed_precision=mixed_precision, critic_layer_norm=layer_norm
@@ -153,7 +153,7 @@ def test_large_values_keep_their_differences(n_actions):
 
 @pytest.mark.parametrize("mixed_precision", [False, True])
 def test_images_may_come_as_bytes(mixed_precision):
-    """The encoder takes bytes as they are, and what SB3 makes of them, to the same features and gradients."""
+    """uint8 images lead to the same features and gradients as the images that SB3's preprocessing scales."""
     space = spaces.Box(0, 255, (3, 40, 40), np.uint8)
     policy = CnnPolicy(space, ACTIONS, lambda _: 1e-3, mixed_precision=mixed_precision)
     plain = copy.deepcopy(policy.critic).double()
@@ -167,7 +167,7 @@ def test_images_may_come_as_bytes(mixed_precision):
 
 
 @pytest.mark.parametrize("policy_class", [MlpPolicy, TD3BCPolicy])
-def test_what_plays_is_computed_in_full_precision(policy_class):
+def test_a_policy_acts_in_float32(policy_class):
     space = spaces.Box(-1, 1, (9,), np.float32)
     policy = policy_class(space, ACTIONS, lambda _: 1e-3, mixed_precision=True)
     actor, observation = copy.deepcopy(policy.actor).double(), np.linspace(-1, 1, 9, dtype=np.float32)
