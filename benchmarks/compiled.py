@@ -1,9 +1,9 @@
 """
-Whether `torch.compile` makes steps faster: CEBORL as it is, and with one of its parts compiled, in turn in one process.
+Measure whether `torch.compile` makes steps faster: CEBORL as it is takes turns with CEBORL with one part compiled.
 
     python benchmarks/compiled.py
 
-Adds the rows `compiled_...` to results/throughput.json. Needs a C++ compiler, and takes minutes, most of them for compiling.
+This adds the rows `compiled_...` to results/throughput.json. It needs a C++ compiler, and takes minutes, mostly to compile.
 """
 
 import json
@@ -17,7 +17,7 @@ from throughput import OBSERVATIONS, RESULTS, comparison, interleave, merge, one
 
 from sb3_offline.common.process import prepare_process
 
-#: Kind of observations to the method of the critics that is compiled
+#: Method of the critics that is compiled, for each kind of observations
 PARTS = {"states": "values", "pixels": "encode"}
 ROUNDS, SECONDS = 5, 1.0
 
@@ -34,7 +34,7 @@ def main() -> None:
                 setattr(critic, part, th.compile(getattr(critic, part)))
             steps = {name: one_step(model) for name, model in models.items()}
             began = time.perf_counter()
-            for _ in range(5):  # sizes of batches change, so it compiles several times
+            for _ in range(5):  # Batches have several sizes, and each is compiled.
                 steps["compiled"]()
             seconds = time.perf_counter() - began
             name = f"compiled_{part}_ceborl_{kind}_bf16"

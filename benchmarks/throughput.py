@@ -1,13 +1,13 @@
 """
-How long a gradient step takes: this library, d3rlpy and Stable-Baselines3, in turn in one process.
+Measure how long a gradient step takes in this library, in d3rlpy and in Stable-Baselines3.
 
     pip install --no-deps d3rlpy==2.8.1
     python benchmarks/throughput.py
 
-Every learner takes whole steps, sampling included, from the same made-up transitions (batch 256; 256 examples; K = 16;
-frames of 64x64x3; PyTorch's default number of threads). The learners take turns, a few steps each, for several rounds; a
-time is the median over all steps, a ratio the median over the rounds of peer / ours, with its quartiles. Writes
-results/throughput.json and docs/images/throughput.png. Leave the machine alone meanwhile.
+Every learner takes whole steps, including sampling, on the same random transitions (batch 256; 256 examples; K = 16; images of
+64x64x3; PyTorch's default number of threads). In one process, the learners take turns for several rounds, with a few steps
+each. A time is the median over all steps. A ratio is the median of peer / ours over the rounds, given with its quartiles. The
+results go to results/throughput.json and docs/images/throughput.png. Run nothing else on the machine meanwhile.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_offline import ALGOS
+from sb3_offline.common.fast import operators
 from sb3_offline.common.process import prepare_process
 from sb3_offline.data.writer import DatasetWriter
 
@@ -46,7 +47,7 @@ Step = Callable[[], Any]
 
 
 class RandomEnv(gym.Env):
-    """Gives SB3's SAC something to fill its replay buffer with."""
+    """Fills the replay buffer of SB3's SAC."""
 
     def __init__(self, observation_space: spaces.Box):
         self.observation_space, self.action_space = observation_space, ACTIONS
@@ -59,7 +60,7 @@ class RandomEnv(gym.Env):
 
 
 def write_transitions(path: Path, space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
-    """:return: observations and actions of all episodes, in their order, the last observation of each left out"""
+    """:return: observations and actions of all episodes, in order, without the last observation of each episode"""
     rng = np.random.default_rng(0)
     observations, actions = [], []
     with DatasetWriter(path, space, ACTIONS, success=False) as writer:
@@ -118,14 +119,14 @@ def d3rlpy_cql(kind: str, observations: np.ndarray, actions: np.ndarray, n_actio
 
 
 def interleave(steps: dict[str, Step], rounds: int, seconds: float) -> dict[str, list[list[float]]]:
-    """:return: for each learner, of each round, the milliseconds of its steps"""
+    """:return: for each learner and each round, the milliseconds that its steps took"""
     times: dict[str, list[list[float]]] = {name: [] for name in steps}
-    for step in steps.values():  # warm-up
+    for step in steps.values():  # Warm up.
         step()
     for _ in range(rounds):
         for name, step in steps.items():
             own: list[float] = []
-            step()  # what the learner before left in the caches is not counted
+            step()  # Not measured, because the caches still hold the data of the learner before.
             while not own or sum(own) < 1e3 * seconds:
                 began = time.perf_counter()
                 step()
@@ -157,12 +158,7 @@ def product_rate(mixed_precision: bool) -> float:
     """:return: operations a second of one large product"""
     dtype = th.bfloat16 if mixed_precision else th.float32
     left, right = th.randn(4096, 256).to(dtype), th.randn(256, 256).to(dtype)
-    product = (
-        (lambda: left @ right.t())
-        if mixed_precision
-        else (lambda: th.ops.mkldnn._linear_pointwise(left, right, None, "none", [], ""))
-    )
-    return 2 * left.numel() * 256 / _fastest(product)
+    return 2 * left.numel() * 256 / _fastest(lambda: operators.product(left, right))
 
 
 def copy_rate() -> float:
@@ -172,8 +168,9 @@ def copy_rate() -> float:
 
 
 def floor_entry(name: str, step: Step, median_ms: float, rate: float, copy_seconds: float) -> dict[str, Any]:
-    """Operations of a step over the rate of a large product, and the time that copying the batch takes."""
-    with FlopCounterMode(display=False, custom_mapping={th.ops.mkldnn._linear_pointwise: _linear_flop}) as counter:
+    """:return: the time of a step beside its floor: its operations at the rate of a large product, and copying the batch"""
+    own = {operators._linear_pointwise: _linear_flop} if operators._linear_pointwise is not None else {}
+    with FlopCounterMode(display=False, custom_mapping=own) as counter:
         step()
     floor = 1e3 * (counter.get_total_flops() / rate + copy_seconds)
     return {
@@ -198,7 +195,7 @@ def _fastest(function: Callable[[], Any]) -> float:
 def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[str, Any]]:
     data = folder / f"{kind}.h5"
     observations, actions = write_transitions(data, OBSERVATIONS[kind])
-    k_of_cql = 16 if kind == "pixels" else 10  # of each of three kinds
+    k_of_cql = 16 if kind == "pixels" else 10  # actions of each of three kinds
     learners = {"ceborl": ("ceborl", {}), "cql": ("cql", {"n_action_samples": k_of_cql})}
     if kind == "states":
         others = ("rce", "bc", "iql", "td3_bc")
@@ -221,7 +218,7 @@ def measure(kind: str, folder: Path, rounds: int, seconds: float) -> list[dict[s
     for name in learners:
         entries.append(comparison(f"{name}_{kind}_bf16_vs_float32", times, f"{name}_bf16", name))
     row_bytes = int(np.prod(OBSERVATIONS[kind].shape)) * OBSERVATIONS[kind].dtype.itemsize
-    example_based = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # CEBORL's; read and written
+    example_based = 2 * row_bytes * (3 * BATCH_SIZE + N_EXAMPLES)  # of CEBORL, read and written
     others = 2 * row_bytes * 2 * BATCH_SIZE
     rates, bandwidth = {"": product_rate(False), "_bf16": product_rate(True)}, copy_rate()
     for name in learners:
@@ -266,7 +263,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="+", choices=OBSERVATIONS, default=list(OBSERVATIONS))
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each learner in each round")
+    parser.add_argument("--seconds", type=float, default=1.0, help="measured time of each learner in each round")
     parser.add_argument("--output", type=Path, default=RESULTS)
     args = parser.parse_args()
     prepare_process()

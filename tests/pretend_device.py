@@ -1,6 +1,6 @@
 """
-A device that is not there: its tensors compute on the CPU, and refuse to meet the CPU's own, as a GPU's do. It bears the name
-"meta", the only one besides "cpu" that PyTorch's CPU build runs backward passes for.
+A pretended device. Its tensors compute on the CPU, but operations on them and on the CPU's own tensors fail, as with a GPU.
+Its name is "meta", because PyTorch's CPU build runs backward passes only for devices named "cpu" or "meta".
 """
 
 from typing import Any
@@ -12,13 +12,14 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 DEVICE = "meta"
 WAITING = {"aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::is_nonzero", "aten::masked_select"}
-MAY_MIX = {"aten::copy_", "aten::_to_copy", "aten::index"}  # a GPU takes indices of the CPU too
+MAY_MIX = {"aten::copy_", "aten::_to_copy", "aten::index"}  # A GPU accepts indices on the CPU.
 
-waits: list[str] = []  # what the CPU waited for the device's results in
+#: Operations in which the CPU waited for a result of the device
+waits: list[str] = []
 
 
 class DeviceTensor(th.Tensor):
-    """Says that it is on the device, and holds a tensor of the CPU."""
+    """A tensor that reports the pretended device, and holds a tensor of the CPU."""
 
     held: th.Tensor
     __torch_function__ = th._C._disabled_torch_function_impl
@@ -68,14 +69,14 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     out = func(*tree_map(_held, args), **tree_map(_held, kwargs))
     if not lands_there:
         return out
-    own = {id(tensor.held): tensor for tensor in there}  # what an operation in place gives back
+    own = {id(tensor.held): tensor for tensor in there}  # Operations in place return their argument.
     return tree_map(lambda value: own.get(id(value)) if id(value) in own else _put(value), out)
 
 
 def pretend(monkeypatch: Any) -> _Mode:
     """
-    :param monkeypatch: pytest's; teaches PyTorch what it does not do for this device by itself
-    :return: to be entered: ``with pretend(monkeypatch): ...``
+    :param monkeypatch: pytest's fixture, which replaces the functions of PyTorch that do not know the device
+    :return: context in which the device exists: ``with pretend(monkeypatch): ...``
     """
     autocast, tensor, save, load = th.autocast, th.tensor, th.save, th.load
 

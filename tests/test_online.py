@@ -1,4 +1,4 @@
-"""From offline to online: stock SAC opens what is exported, and mixes the dataset with what it collects."""
+"""SB3's SAC opens exported models, and mixes the dataset with the transitions that it collects."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_sac_goes_on_from_the_same_policy(algo, policy, files, tmp_path):  # noq
         set_random_seed(0)
         wanted = model.predict(observations, deterministic=deterministic)[0]
         set_random_seed(0)
-        tolerance = 1e-6 if algo == "td3_bc" else 0  # its layers stand in another order
+        tolerance = 1e-6 if algo == "td3_bc" else 0  # SAC computes its deterministic actor by other products.
         np.testing.assert_allclose(
             sac.predict(observations, deterministic=deterministic)[0], wanted, rtol=tolerance, atol=tolerance
         )
@@ -39,7 +39,7 @@ def test_sac_goes_on_from_the_same_policy(algo, policy, files, tmp_path):  # noq
     assert changed == {"actor", "critic", "critic_target"} and sac._n_updates >= 5
 
 
-def test_what_cannot_be_exported_is_named(files, tmp_path):  # noqa: F811
+def test_errors_name_what_cannot_be_exported(files, tmp_path):  # noqa: F811
     with pytest.raises(TypeError, match="BC has no critic"):
         export_sac(BC("MlpPolicy", None, files["MlpPolicy"][0]), tmp_path / "sac")
     with pytest.raises(ValueError, match=r"data_ratio is 1\.5"):
@@ -53,7 +53,7 @@ def test_batches_mix_dataset_and_environment_in_the_ratio(space, tmp_path):
     buffer = kind(20, space, ACTIONS, "cpu", dataset=str(tmp_path / "d.h5"), data_ratio=0.25)
     recorded = set(np.concatenate([make_episode(i, space)["rewards"] for i in range(5)]))
     batch = buffer.sample(16)
-    assert len(batch.rewards) == 16 and set(batch.rewards.numpy().ravel()) <= recorded  # nothing else is there yet
+    assert len(batch.rewards) == 16 and set(batch.rewards.numpy().ravel()) <= recorded  # SAC has collected nothing yet.
     observation = batch_of(space, 1)
     for _ in range(3):
         buffer.add(observation, observation, np.zeros((1, 2), np.float32), np.array([77.0]), np.array([False]), [{}])
@@ -65,7 +65,7 @@ def test_batches_mix_dataset_and_environment_in_the_ratio(space, tmp_path):
     assert {len(array) for array in arrays} == {16} and batch.actions.shape == (16, 2) and batch.dones.shape == (16, 1)
 
 
-def test_sac_goes_on_with_the_rewards_that_the_critic_knows(files, tmp_path):  # noqa: F811
+def test_sac_goes_on_with_the_rewards_that_the_critic_learned_from(files, tmp_path):  # noqa: F811
     model = make("cql", "MlpPolicy", files, reward_fn="success").learn(1)
     export_sac(model, tmp_path / "sac", data_ratio=0.5, buffer_size=100)
     sac = SAC.load(tmp_path / "sac", env=ForbiddenEnv(STATES, allowed=True))

@@ -1,4 +1,4 @@
-"""Actor-only policies: the offline policies without a critic, so that the actor trains its own encoder."""
+"""Policies without a critic, whose actor trains its own encoder."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ class BCPolicy(OfflinePolicy):
     """
     Policy class of behavioral cloning.
 
-    :param kwargs: see :class:`~sb3_offline.common.policies.OfflinePolicy`; what concerns critics has no effect
+    :param kwargs: see :class:`~sb3_offline.common.policies.OfflinePolicy`; arguments for critics have no effect
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class BCPolicy(OfflinePolicy):
         **kwargs: Any,
     ):
         if share_features_extractor:
-            raise TypeError("BC has no critic that its actor could share an encoder with")
+            raise TypeError("BC has no critic to share an encoder with; leave out share_features_extractor")
         super().__init__(
             observation_space,
             action_space,

@@ -6,19 +6,19 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-# Images that share one offset. A slice per group is much cheaper than a gather per image, and 8 to 24 different offsets in
-# a batch are enough.
+# Number of images that share one offset. Slicing a group takes much less time than gathering each image, and 8 to 24 different
+# offsets in a batch are enough.
 GROUP_SIZE = 32
 
 
 def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) -> th.Tensor:
     """
-    Shift images by up to ``max_shift`` pixels in both directions, repeating their edges. Images share a shift in groups of
-    ``GROUP_SIZE``: those of a batch of 32 are all shifted alike.
+    Shift images by up to ``max_shift`` pixels in each direction, and repeat their edges. Each group of ``GROUP_SIZE`` images
+    is shifted alike, so a batch of 32 images has one shift.
 
     :param images: ``(batch, channels, height, width)``, any dtype
-    :param max_shift: largest shift in pixels; 0 returns the images as they are
-    :param rng: source of the offsets
+    :param max_shift: largest shift in pixels; 0 returns ``images`` itself
+    :param rng: generator that draws the shifts
     :return: a tensor like ``images``
     """
     if max_shift == 0:
@@ -36,7 +36,7 @@ def random_shift(images: th.Tensor, max_shift: int, rng: np.random.Generator) ->
 
 
 def _overlap(size: int, offset: int) -> tuple[slice, slice]:
-    """:return: where the pixels go that stay inside, and where they come from"""
+    """:return: the lines that shifted lines are copied to, and the lines that they are copied from"""
     first, kept = max(-offset, 0), size - abs(offset)
     return slice(first, first + kept), slice(first + offset, first + offset + kept)
 
@@ -51,9 +51,9 @@ def _repeat_edges(images: th.Tensor, filled: slice, dim: int) -> None:
 
 def has_images(space: spaces.Space, float_images: bool = False) -> bool:
     """
-    :param space: of observations
+    :param space: observation space
     :param float_images: see :func:`shift_observations`
-    :return: whether there is anything in them to shift
+    :return: whether observations contain images, which could be shifted
     """
     parts = space.values() if isinstance(space, spaces.Dict) else [space]
     return any(is_image_space(part, normalized_image=float_images) for part in parts)
@@ -63,14 +63,14 @@ def shift_observations(
     observations: PyTorchObs, space: spaces.Space, max_shift: int, rng: np.random.Generator, float_images: bool = False
 ) -> PyTorchObs:
     """
-    Apply :func:`random_shift` to every image in a batch of observations; vectors pass unchanged.
+    Apply :func:`random_shift` to all images in a batch of observations. Vectors stay as they are.
 
     :param observations: a batch, or a dict of batches
-    :param space: channel-first space of one observation
+    :param space: space of one observation, images channel-first
     :param max_shift: largest shift in pixels
-    :param rng: source of the offsets
-    :param float_images: whether arrays of three axes are images that are normalised already, whatever their dtype
-    :return: the observations, shifted
+    :param rng: generator that draws the shifts
+    :param float_images: treat arrays with three axes as normalised images, whatever their dtype
+    :return: observations like the given ones
     """
     if isinstance(space, spaces.Dict):
         parts = {key: (observations[key], space[key]) for key in space}  # type: ignore[index]

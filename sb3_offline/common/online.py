@@ -1,4 +1,4 @@
-"""From offline to online: models that go on learning as Stable-Baselines3's own SAC."""
+"""Export of offline models to Stable-Baselines3's SAC, which goes on learning online."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ from sb3_offline.common.reward_based import RewardBasedAlgorithm
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.mixed import MixedDictReplayBuffer, MixedReplayBuffer
 
-#: Standard deviation, before the tanh, of a policy that had none
+#: Standard deviation before the tanh that a deterministic policy is given
 ADDED_STD = 0.1
 
 
@@ -31,26 +31,31 @@ def export_sac(
     **kwargs: Any,
 ) -> None:
     """
-    Save an actor-critic as a zip that ``SAC.load(path, env=env)`` of stock Stable-Baselines3 opens. Its ``predict`` is that
-    of the model. The policy class stays this library's, which is one of SAC's: the critic alone goes on training a shared
-    encoder, and observations are standardised as they were.
+    Save an actor-critic as a zip that ``SAC.load(path, env=env)`` of Stable-Baselines3 opens, and that predicts as the model.
 
-    Critics of rewards are kept. Those of learners from examples are no values of rewards: SAC gets new ones, on the same
-    encoder. A deterministic actor gets a standard deviation of 0.1 before the tanh.
+    The policy keeps its class, which is a subclass of SAC's policy. So the critic alone goes on training a shared encoder, and
+    observations are standardised as before.
 
-    :param model: a trained actor-critic. If it learned with a ``VecNormalize``, that one must be its environment, and SAC must
-        be loaded with it too: ``RuntimeError`` without it
-    :param path: the zip to write
-    :param data_ratio: share of each batch of SAC that comes from the model's dataset, which must have rewards; 0: none does
+    Critics that learned from rewards are kept. Critics that learned from examples do not estimate rewards, so SAC gets new
+    ones on the same encoder. A deterministic actor gets a standard deviation of 0.1 before the tanh.
+
+    :param model: trained actor-critic. If it learned with a ``VecNormalize``, that must be its environment, and SAC must be
+        loaded with it too
+    :param path: path of the zip
+    :param data_ratio: share of each of SAC's batches that comes from the model's dataset, which must have rewards
     :param buffer_size: see :class:`stable_baselines3.sac.SAC`
-    :param learning_starts: environment steps of random actions; SAC's default, 100, would not play the policy at first
-    :param ent_coef: entropy coefficient; SAC's default, which starts at 1, would at first reward randomness more than anything
-    :param kwargs: further arguments of :class:`stable_baselines3.sac.SAC`; default: the model's learning rate, batch size,
-        ``tau``, ``gamma``, and seed
+    :param learning_starts: environment steps with random actions; with SAC's default, 100, the policy would not act at first
+    :param ent_coef: entropy coefficient; SAC's default starts at 1, where the entropy outweighs the rewards
+    :param kwargs: further arguments of :class:`stable_baselines3.sac.SAC`; learning rate, batch size, ``tau``, ``gamma`` and
+        seed default to the model's
+    :raises TypeError: if the model has no critic
+    :raises RuntimeError: if the model learned with a ``VecNormalize`` and its environment is none
+    :raises ValueError: if ``data_ratio`` is not between 0 and 1
+    :raises DatasetError: if ``data_ratio`` is positive and the dataset has no rewards
     """
     if not isinstance(model, ActorCriticAlgorithm):
         remedy = "export an actor-critic, such as CQL, IQL, TD3BC or CEBORL"
-        raise TypeError(f"{type(model).__name__} has no critic that SAC could go on with; {remedy}")
+        raise TypeError(f"{type(model).__name__} has no critic for SAC to go on with; {remedy}")
     model._data.check_normalizer(model._vec_normalize_env)
     if not 0 <= data_ratio <= 1:
         raise ValueError(f"data_ratio is {data_ratio}; give a share between 0 and 1")
@@ -59,11 +64,11 @@ def export_sac(
     if not keeps_critic:
         policy_kwargs.pop("critic_output_bias", None)
     arguments = {name: getattr(model, name) for name in ("learning_rate", "batch_size", "tau", "gamma", "device")}
-    seed = kwargs.pop("seed", model.seed)  # not to the constructor, which would reseed all generators here
+    seed = kwargs.pop("seed", model.seed)  # The constructor would seed all generators of this process with it.
     sac = SAC(
         _policy_class(model.policy),
         model.get_env(),  # type: ignore[arg-type]
-        buffer_size=1,  # none is allocated here
+        buffer_size=1,  # The buffer of this object stays empty.
         learning_starts=learning_starts,
         ent_coef=ent_coef,
         policy_kwargs=policy_kwargs,
@@ -79,7 +84,7 @@ def export_sac(
             problem, remedy = "are missing, but SAC learns from them", "Give a dataset with rewards, or data_ratio=0"
             raise DatasetError(buffer.datasets[0].path, "rewards", problem, remedy)
         sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
-        if buffer.is_relabelled:  # SAC goes on with the rewards that the critic knows
+        if buffer.is_relabelled:  # SAC goes on with the rewards that the critic learned from.
             sac.replay_buffer_kwargs.update(rewards=buffer.rewards, checksum=buffer.checksum())
     sac.save(Path(path))
 

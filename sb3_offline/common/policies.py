@@ -1,14 +1,18 @@
 """
 Actor-critic policies of the offline algorithms.
 
-They are SB3's SAC policies with the differences that offline learning needs: vectors are standardised by the dataset's
-statistics; the encoder is trained by the critic (SB3 lets the *actor* train a shared one) and run once per image however
-many actions are then scored; the actor scores given actions, with a floor under its standard deviation; and the critic may
-have a head for the value of a state without an action.
+They are SB3's SAC policies with the differences that offline learning needs:
+
+- vectors are standardised with the dataset's statistics;
+- the critic trains a shared encoder, where SB3 lets the *actor* train it, and each image is encoded once, however many actions
+  are then scored;
+- the actor scores given actions, and its standard deviation has a floor;
+- the critic may have a head for the value of a state without an action.
 """
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,21 +25,21 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from sb3_offline.common.linear import has_fast_bfloat16, linear, run_layers
+from sb3_offline.common.fast import encode, linear_heads, mlp, state_action_values
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
-# Actions of a dataset often sit exactly on the bounds, where atanh is infinite.
+# A dataset's actions often lie exactly on the bounds, where atanh is infinite. Before it, they are clamped to this.
 ACTION_LIMIT = 0.999
-# Under the logarithm of tanh's slope, as in SB3
+# Added to tanh's slope before its logarithm is taken, as in SB3
 SQUASHING_EPSILON = 1e-6
 
 
 class EncodingActor(BasePolicy):
     """
-    What actors share whose encoder may be the critic's: features to learn from.
+    Base class of actors, whose encoder may be the critic's.
 
     :param args: see :class:`stable_baselines3.common.policies.BasePolicy`
-    :param detach_encoder: whether the encoder belongs to the critic, so that no gradient of the actor reaches it
+    :param detach_encoder: keep the actor's gradients from the encoder, because it belongs to the critic
     :param kwargs: see :class:`stable_baselines3.common.policies.BasePolicy`
     """
 
@@ -50,11 +54,11 @@ class EncodingActor(BasePolicy):
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
-        :return: features, ``(batch, features_dim)``, in the dtype that learning computes in, and cut from the graph where the
-            encoder is the critic's
+        :return: features to learn from, ``(batch, features_dim)``, in bfloat16 or float32; without a graph if
+            ``detach_encoder``
         """
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
-            return _encode(self, obs)
+            return encode(partial(_features, self), obs, self.mixed_precision)
 
 
 class OfflineActor(EncodingActor, Actor):
@@ -62,8 +66,8 @@ class OfflineActor(EncodingActor, Actor):
     Tanh-Gaussian actor (policy) that can also score given actions.
 
     :param args: see :class:`stable_baselines3.sac.policies.Actor`
-    :param std_min: floor of the standard deviation *before* the tanh squashing. A positive floor keeps the likelihood of
-        dataset actions bounded.
+    :param std_min: floor of the standard deviation *before* the tanh. A positive floor bounds the likelihood of the dataset's
+        actions.
     :param kwargs: see :class:`EncodingActor` and :class:`stable_baselines3.sac.policies.Actor`
     """
 
@@ -75,8 +79,13 @@ class OfflineActor(EncodingActor, Actor):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "std_min": self.std_min}
 
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if deterministic:  # SB3's distribution gives the same, but checks its numbers, which cannot be exported.
+            return th.tanh(self.get_action_dist_params(obs)[0])
+        return super().forward(obs, deterministic)
+
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        # What plays is computed in full precision, whatever learning is.
+        # A policy that acts computes in float32, whatever it learned in.
         mean, log_std = self.gaussian_parameters(self.extract_features(obs, self.features_extractor))
         return mean, log_std, {}
 
@@ -86,17 +95,15 @@ class OfflineActor(EncodingActor, Actor):
         :return: mean and log standard deviation of the Gaussian before tanh, each ``(batch, action_dim)``
         """
         assert isinstance(self.mu, nn.Linear) and isinstance(self.log_std, nn.Linear)
-        weight = th.cat([self.mu.weight, self.log_std.weight])
-        last = weight, th.cat([self.mu.bias, self.log_std.bias])
-        mean, log_std = run_layers([*self.latent_pi, last], features).to(weight.dtype).chunk(2, dim=1)  # type: ignore[misc]
+        mean, log_std = linear_heads(self.latent_pi, (self.mu, self.log_std), features)
         return mean, th.clamp(log_std, self.log_std_min, LOG_STD_MAX)
 
     def sample(self, features: th.Tensor, n_samples: int | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
-        Reparametrised actions in [-1, 1] and their log-probabilities.
+        Draw reparametrised actions in [-1, 1], and compute their log-probabilities.
 
         :param features: ``(batch, features_dim)``
-        :param n_samples: actions per state; ``None`` for one, without an axis of its own
+        :param n_samples: actions per state; ``None`` draws one, and the results have no axis for it
         :return: actions ``(batch[, n_samples], action_dim)`` and log-probabilities ``(batch[, n_samples])``
         """
         mean, log_std = self.gaussian_parameters(features)
@@ -109,7 +116,7 @@ class OfflineActor(EncodingActor, Actor):
     def log_prob(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         :param features: ``(batch, features_dim)``
-        :param actions: ``(batch, action_dim)`` in [-1, 1]; moved inside +-0.999, where tanh can be inverted
+        :param actions: ``(batch, action_dim)`` in [-1, 1]; clamped to +-0.999, where tanh can be inverted
         :return: log-probability density of each action, ``(batch,)``
         """
         mean, log_std = self.gaussian_parameters(features)
@@ -118,10 +125,10 @@ class OfflineActor(EncodingActor, Actor):
 
     def regression_loss(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        Squared error of the mode, and the negative log-likelihood of the standard deviation around that mode.
+        Add the squared error of the mode and the negative log-likelihood of the standard deviation around that mode.
 
-        Steadier than the likelihood of both together: an action on the bounds lies far out before the tanh, where a few such
-        actions move the mean of a Gaussian more than all the others.
+        This loss is steadier than the likelihood of both together. Before the tanh, an action on the bounds lies far out, and
+        a few such actions move the mean of a Gaussian more than all others.
 
         :param features: ``(batch, features_dim)``
         :param actions: ``(batch, action_dim)`` in [-1, 1]
@@ -135,12 +142,12 @@ class OfflineActor(EncodingActor, Actor):
 
 def _log_density(actions: th.Tensor, log_std: th.Tensor, squared_noise: th.Tensor) -> th.Tensor:
     """
-    What SB3's ``SquashedDiagGaussianDistribution`` gives, with a third of its operations, each of which takes longer than its
-    few numbers.
+    Compute the log-densities of SB3's ``SquashedDiagGaussianDistribution`` with a third of its operations. On so few numbers,
+    the number of operations decides how long they take.
 
-    :param actions: tanh of a Gaussian, ``(..., action_dim)``
-    :param log_std: of the Gaussian
-    :param squared_noise: squared distances from the mean, in standard deviations
+    :param actions: tanh of samples of a Gaussian, ``(..., action_dim)``
+    :param log_std: logarithm of the Gaussian's standard deviation, broadcast to ``actions``
+    :param squared_noise: squared distances of the samples from the mean, in standard deviations, like ``actions``
     :return: log-probability density, ``(...)``
     """
     terms = 0.5 * squared_noise + log_std + th.log(1 + SQUASHING_EPSILON - actions.pow(2))
@@ -151,11 +158,11 @@ class OfflineCritic(ContinuousCritic):
     """
     Critic networks on one encoder, which their loss trains.
 
-    :param layer_norm: put a LayerNorm after each hidden linear layer of the heads
-    :param output_bias: what the heads put out at first, for all states and actions
-    :param state_value: whether to add a head that sees the state without an action
+    The parameters not listed here are those of :class:`stable_baselines3.common.policies.ContinuousCritic`.
 
-    The others are those of :class:`stable_baselines3.common.policies.ContinuousCritic`.
+    :param layer_norm: put a LayerNorm after each hidden linear layer of the heads
+    :param output_bias: initial output of the heads, for all states and actions
+    :param state_value: add a head that sees the state without an action
     """
 
     def __init__(
@@ -173,7 +180,7 @@ class OfflineCritic(ContinuousCritic):
         output_bias: float = 0.0,
         state_value: bool = False,
     ):
-        # Not ContinuousCritic's constructor, which would build heads of its own first.
+        # ContinuousCritic's own constructor is skipped, because it would build other heads first.
         super(ContinuousCritic, self).__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
@@ -193,85 +200,60 @@ class OfflineCritic(ContinuousCritic):
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
-        :return: features, ``(batch, features_dim)``, in the dtype that learning computes in
+        :return: features to learn from, ``(batch, features_dim)``, in bfloat16 or float32
         """
-        return _encode(self, obs)
+        return encode(partial(_features, self), obs, self.mixed_precision)
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        Outputs of all critics, for one or for many actions per state.
-
-        The first layer is split into a product with the features, once a state, and one with the actions, once an action:
-        with K actions a state only their sum is K times as large.
+        Compute the outputs of all critics, for one or for many actions per state.
 
         :param features: ``(batch, features_dim)``
         :param actions: ``(batch, action_dim)``, or ``(batch, K, action_dim)``, in [-1, 1]
         :return: ``(n_critics, batch)``, or ``(n_critics, batch, K)``
         """
-        actions = actions.to(features.dtype)
-        if actions.dim() == 2:
-            pairs = th.cat([features, actions], dim=1)
-            outputs = [run_layers(list(q_net), pairs).squeeze(1) for q_net in self.q_networks]  # type: ignore[call-overload]
-            return th.stack(outputs).to(self._parameter_dtype)
-        samples = actions.transpose(0, 1)  # (K, batch, .): what depends on states alone is added along whole rows
-        outputs = []
-        for q_net in self.q_networks:
-            assert isinstance(q_net, nn.Sequential) and isinstance(q_net[0], nn.Linear)
-            state_weight, action_weight = q_net[0].weight.split([features.shape[1], actions.shape[-1]], dim=1)
-            of_state = linear(features, state_weight, q_net[0].bias)
-            values = run_layers([(action_weight, of_state), *list(q_net)[1:]], samples.flatten(0, 1))
-            outputs.append(values.view(samples.shape[:2]))
-        return th.stack(outputs).to(self._parameter_dtype).transpose(1, 2)
+        return state_action_values(self.q_networks, features, actions)  # type: ignore[arg-type]
 
     def state_values(self, features: th.Tensor) -> th.Tensor:
         """
         :param features: ``(batch, features_dim)``
-        :return: output of the state head, ``(batch,)``
+        :return: outputs of the state head, ``(batch,)``
         """
         head = self.get_submodule("vf")
         assert isinstance(head, nn.Sequential)
-        return run_layers(list(head), features).squeeze(1).to(self._parameter_dtype)
-
-    @property
-    def _parameter_dtype(self) -> th.dtype:
-        return self.q_networks[0][-1].weight.dtype  # type: ignore
+        return mlp(head, features).squeeze(1)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:  # type: ignore[override]
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
 
 
-def _encode(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
-    """Features of observations; all that is computed from them keeps their dtype, so it is chosen here."""
+def _features(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
+    """:return: features of observations as they are stored, ``(batch, features_dim)``"""
     encoder = module.features_extractor
-    device = (next(iter(obs.values())) if isinstance(obs, dict) else obs).device  # SB3's `module.device` walks through modules
-    bfloat16 = has_fast_bfloat16(device) if module.mixed_precision is None else module.mixed_precision
-    with th.autocast(device.type, th.bfloat16, enabled=bfloat16):
-        if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
-            features = encoder(obs)  # scales bytes by itself, which is cheaper than SB3's preprocessing
-        else:
-            features = module.extract_features(obs, encoder)
-    return features.bfloat16() if bfloat16 else features
+    if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
+        return encoder(obs)  # It scales uint8 images by itself, which is cheaper than SB3's preprocessing.
+    return module.extract_features(obs, encoder)
 
 
 class OfflinePolicy(SACPolicy):
     """
-    Policy class (with both actor and critic) of the offline actor-critic algorithms. Its parameters bear the names that
-    :class:`stable_baselines3.sac.policies.SACPolicy` gives them.
+    Policy class (with both actor and critic) of the offline actor-critic algorithms. Its networks have the same names as those
+    of :class:`stable_baselines3.sac.policies.SACPolicy`.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
-    :param share_features_extractor: whether actor and critic share one encoder, trained by the critic alone
+    :param share_features_extractor: let actor and critic share one encoder, which the critic alone trains
     :param std_min: floor of the actor's standard deviation before the tanh
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
-    :param critic_output_bias: what the critics put out at first, everywhere
-    :param critic_state_value: add a critic of states alone
-    :param mixed_precision: learn with matrix products and convolutions in bfloat16, or in float32; ``None`` takes bfloat16
-        where the device has instructions for it. Parameters, losses, the optimizers' state, and the policy when it plays, are
-        in float32 in any case.
-    :param features_extractor_class: encoder of the observations (default: that of the class)
+    :param critic_output_bias: initial output of the critics, for all states and actions
+    :param critic_state_value: add a critic that sees the state without an action
+    :param mixed_precision: compute matrix products and convolutions in bfloat16 when learning, or in float32; ``None`` takes
+        bfloat16 if the device has instructions for it. Parameters, losses and the optimizers' states are always float32, and
+        so is a policy that acts.
+    :param features_extractor_class: encoder of the observations (default: ``default_features_extractor_class``)
     :param kwargs: all other arguments of :class:`stable_baselines3.sac.policies.SACPolicy`: ``net_arch``, ``activation_fn``,
-        ``features_extractor_class``, ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
+        ``features_extractor_kwargs``, ``n_critics``, ``optimizer_class``, ...
     """
 
     default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = StandardizedExtractor
@@ -326,7 +308,7 @@ class OfflinePolicy(SACPolicy):
         self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
 
     def set_training_mode(self, mode: bool) -> None:
-        if mode != self.training:  # learners ask for it in each step, and a walk through all modules takes a while
+        if mode != self.training:  # Learners call this in each step, and a walk through all modules takes a while.
             super().set_training_mode(mode)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
@@ -359,8 +341,8 @@ class OfflinePolicy(SACPolicy):
         """
         Fit every :class:`~sb3_offline.common.torch_layers.StandardizedExtractor` that is not fitted yet.
 
-        :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for the named keys
-            of dict observations; called only where there is something to fit
+        :param statistics: function that returns (mean, variance, count) of the dataset's observations, or a dict of such
+            triples for the given keys of dict observations. It is called only if there is something to fit.
         """
         unfitted = {encoder: key for encoder, key in self._standardized_encoders().items() if not encoder.fitted}
         if unfitted:
@@ -371,11 +353,14 @@ class OfflinePolicy(SACPolicy):
 
     @property
     def standardizes(self) -> bool:
-        """Whether statistics of a dataset are fitted already."""
+        """``True`` once the statistics of a dataset are fitted."""
         return any(bool(encoder.fitted) for encoder in self._standardized_encoders())
 
     def _standardized_encoders(self) -> dict[StandardizedExtractor, str]:
-        """Encoders of vectors, with their keys in dict observations. One-hot vectors and flattened images stay as they are."""
+        """
+        :return: the encoders of vectors, with their keys in dict observations. One-hot vectors and flattened images are not
+            standardised.
+        """
         encoders = {
             module: ""
             for module in self.modules()
@@ -402,7 +387,7 @@ class CnnPolicy(OfflinePolicy):
 
 class MultiInputPolicy(OfflinePolicy):
     """
-    :class:`OfflinePolicy` for dict observations: images and vectors are encoded apart and concatenated.
+    :class:`OfflinePolicy` for dict observations: images and vectors are encoded separately and concatenated.
     """
 
     default_features_extractor_class = StandardizedCombinedExtractor

@@ -6,21 +6,20 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from torch import nn
-from torch.nn import functional as F
 
-from sb3_offline.common.linear import run_layers
+from sb3_offline.common.fast import convolutions, mlp, prepare_convolutions
 
 
 class StandardizedExtractor(FlattenExtractor):
     """
-    Flattens vectors and gives each entry the mean 0 and the standard deviation 1 that it has in the dataset.
+    Flatten vectors and standardise them, so that each entry has mean 0 and standard deviation 1 over the dataset.
 
-    The statistics are fitted once, by :meth:`fit`, and saved with the policy. Before that, observations pass unchanged.
+    The statistics are fitted once, by :meth:`fit`, and saved with the policy. Before that, vectors are only flattened.
 
-    Entries that hardly move in the dataset are amplified by no more than ``1 / std_min``. Such entries are often constant
-    within an episode, and would let a classifier recognise episodes instead of success.
+    Entries that hardly change in the dataset are amplified by at most ``1 / std_min``. Such entries are often constant within
+    an episode, and would let a classifier recognise episodes instead of success.
 
-    :param observation_space: vectors
+    :param observation_space: space of vectors
     :param std_min: floor of the standard deviation
     """
 
@@ -33,31 +32,31 @@ class StandardizedExtractor(FlattenExtractor):
         self.std_min = std_min
         self.register_buffer("mean", th.zeros(self.features_dim))
         self.register_buffer("std", th.ones(self.features_dim))
-        self.register_buffer("fitted", th.zeros(()))  # 1 once it is; a float, as all parameters in SB3
+        self.register_buffer("fitted", th.zeros(()))  # 1 after `fit`; a float, as all parameters in SB3
 
     def fit(self, mean: np.ndarray, variance: np.ndarray) -> None:
         """
-        :param mean: of the observations, of their shape
-        :param variance: of the observations, of their shape
+        :param mean: mean of the dataset's observations, in the shape of one observation
+        :param variance: variance of the dataset's observations, in the same shape
         """
         self.mean.copy_(th.as_tensor(mean, dtype=th.float32).flatten())
         self.std.copy_(th.as_tensor(np.sqrt(variance), dtype=th.float32).flatten().clamp(min=self.std_min))
         self.fitted.fill_(1.0)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return (super().forward(observations) - self.mean) / self.std
+        return (self.flatten(observations) - self.mean) / self.std
 
 
 class NormalizedNatureCNN(NatureCNN):
     """
     SB3's :class:`~stable_baselines3.common.torch_layers.NatureCNN` with a LayerNorm and a tanh in place of the last ReLU.
 
-    Bounded features keep the logits of a classifier on top of them bounded too; with plain ReLU features a classifier that
-    is trained on its own predictions drifts more easily.
+    Bounded features bound the logits of a classifier on top of them. With plain ReLU features, a classifier that is trained
+    on its own predictions drifts more easily.
 
-    Takes images scaled to [0, 1], as SB3's preprocessing gives them, or uint8 images as they are.
+    The encoder takes images in [0, 1], as SB3's preprocessing returns them, or uint8 images, which it scales itself.
 
-    :param observation_space: uint8 images, channel-first
+    :param observation_space: space of uint8 images, channel-first
     :param features_dim: number of features, each in [-1, 1]
     :param normalized_image: see :class:`~stable_baselines3.common.torch_layers.NatureCNN`
     """
@@ -65,28 +64,21 @@ class NormalizedNatureCNN(NatureCNN):
     def __init__(self, observation_space: spaces.Box, features_dim: int = 512, normalized_image: bool = False):
         super().__init__(observation_space, features_dim, normalized_image)
         self.linear = nn.Sequential(self.linear[0], nn.LayerNorm(features_dim), nn.Tanh())
-        # The layout that batches of the datasets come in; convolutions are up to twice as fast in it.
-        self.cnn.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+        prepare_convolutions(self.cnn)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        images = observations.contiguous(memory_format=th.channels_last)
-        if images.dtype != th.uint8:
-            hidden = self.cnn(images)
-        else:  # the scale goes into the first layer's few weights instead of all pixels
-            first = self.cnn[0]
-            assert isinstance(first, nn.Conv2d)
-            device = images.device.type
-            dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else first.weight.dtype
-            hidden = self.cnn[1:](F.conv2d(images.to(dtype), first.weight / 255.0, first.bias, first.stride))
-        return run_layers(list(self.linear), hidden)
+        if th.jit.is_scripting():  # TorchScript compiles PyTorch's own modules only.
+            images = observations / 255.0 if observations.dtype == th.uint8 else observations
+            return self.linear(self.cnn(images))
+        return mlp(self.linear, convolutions(self.cnn, observations))
 
 
 class StandardizedCombinedExtractor(CombinedExtractor):
     """
-    SB3's :class:`~stable_baselines3.common.torch_layers.CombinedExtractor` with the encoders of this module: images go
-    through :class:`NormalizedNatureCNN`, vectors through :class:`StandardizedExtractor`.
+    SB3's :class:`~stable_baselines3.common.torch_layers.CombinedExtractor` with the encoders of this module:
+    :class:`NormalizedNatureCNN` for images and :class:`StandardizedExtractor` for vectors.
 
-    :param observation_space: dict of images (channel-first) and vectors
+    :param observation_space: dict space of images (channel-first) and vectors
     :param cnn_output_dim: number of features of each image
     :param normalized_image: see :class:`~stable_baselines3.common.torch_layers.NatureCNN`
     """
@@ -100,5 +92,5 @@ class StandardizedCombinedExtractor(CombinedExtractor):
             elif isinstance(space, spaces.Box):
                 encoder = StandardizedExtractor(space)
             else:
-                continue  # one-hot vectors stay as they are
+                continue  # One-hot vectors are not standardised.
             self.extractors[key] = encoder

@@ -1,18 +1,18 @@
-"""Policies with a deterministic actor and a target of it."""
+"""Policies with a deterministic actor and a target actor."""
 
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor
 
-from sb3_offline.common.linear import run_layers
+from sb3_offline.common.fast import mlp
 from sb3_offline.common.policies import EncodingActor, OfflinePolicy
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor
 
 
 class DeterministicActor(EncodingActor, Actor):
     """
-    SB3's actor of TD3, whose encoder may be the critic's.
+    SB3's TD3 actor, whose encoder may be the critic's.
 
     :param args: see :class:`stable_baselines3.td3.policies.Actor`
     :param kwargs: see :class:`~sb3_offline.common.policies.EncodingActor` and :class:`stable_baselines3.td3.policies.Actor`
@@ -20,14 +20,14 @@ class DeterministicActor(EncodingActor, Actor):
 
     def act(self, features: th.Tensor) -> th.Tensor:
         """
-        :param features: ``(batch, features_dim)``; the products are computed in their dtype
+        :param features: ``(batch, features_dim)``
         :return: actions in [-1, 1], ``(batch, action_dim)``
         """
         *layers, squash = self.mu
-        return squash(run_layers(layers, features).to(next(self.mu.parameters()).dtype))
+        return squash(mlp(layers, features))
 
     def forward(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
-        return super().forward(obs)  # what plays is computed in full precision, whatever learning is
+        return super().forward(obs)  # A policy that acts computes in float32, whatever it learned in.
 
 
 class TD3BCPolicy(OfflinePolicy):
