@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import sb3_offline.envs  # noqa: F401  (registers the environments)
+from sb3_offline.awac import AWAC
 from sb3_offline.bc import BC
 from sb3_offline.ceborl import CEBORL
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
@@ -17,6 +18,7 @@ __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 #: All algorithms by the names that configs and the command line use.
 ALGOS: dict[str, type[OfflineAlgorithm]] = {
+    "awac": AWAC,
     "bc": BC,
     "ceborl": CEBORL,
     "cql": CQL,
@@ -27,4 +29,17 @@ ALGOS: dict[str, type[OfflineAlgorithm]] = {
     "td3_bc": TD3BC,
 }
 
-__all__ = ["ALGOS", "BC", "CEBORL", "CQL", "DCQL", "IQL", "ORIL", "RCE", "TD3BC", "OfflineAlgorithm", "__version__"]
+__all__ = [
+    "ALGOS",
+    "AWAC",
+    "BC",
+    "CEBORL",
+    "CQL",
+    "DCQL",
+    "IQL",
+    "ORIL",
+    "RCE",
+    "TD3BC",
+    "OfflineAlgorithm",
+    "__version__",
+]

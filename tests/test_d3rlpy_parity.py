@@ -1,5 +1,5 @@
 """
-CQL, IQL and TD3+BC against d3rlpy: the same weights, batch and noise give the same losses.
+AWAC, CQL, IQL and TD3+BC against d3rlpy: the same weights, batch and noise give the same losses.
 
 Where the conventions differ, the tests say how:
 
@@ -8,6 +8,8 @@ Where the conventions differ, the tests say how:
 - d3rlpy's loss of the entropy coefficient has the coefficient where SB3's has its logarithm: Adam's first step is the same.
 - IQL's policy is a Gaussian around tanh(mean) there; ours is squashed, fitted by squared error. The weights are the same.
 - SB3 adds 1e-6 inside of the logarithm of a squashed Gaussian's density.
+- AWAC's policy is a Gaussian around tanh(mean) there, as IQL's. Its target has an entropy term, with a coefficient of 1, which
+  neither the paper nor the authors' code has. Its actor's loss is a sum over the batch; ours, as the authors', is a mean.
 """
 
 import numpy as np
@@ -16,7 +18,7 @@ import torch as th
 from data_files import ACTIONS, write_dataset
 from gymnasium import spaces
 
-from sb3_offline import CQL, IQL, TD3BC
+from sb3_offline import AWAC, CQL, IQL, TD3BC
 
 d3rlpy = pytest.importorskip("d3rlpy", reason="see CONTRIBUTING.md for how to install it")
 
@@ -188,3 +190,26 @@ def test_td3_bc(dataset, monkeypatch):
     assert losses[1] == losses[0] == pytest.approx(impl.compute_critic_loss(theirs, targets).critic_loss.item(), rel=1e-5)
     actor = impl.compute_actor_loss(theirs, modules.policy(theirs.observations))
     assert losses[2] == pytest.approx(actor.actor_loss.item(), rel=1e-5)
+
+
+def test_awac(dataset, monkeypatch):
+    from d3rlpy.models.torch.distributions import GaussianDistribution, SquashedGaussianDistribution
+
+    model, batch, losses = make(AWAC, dataset, monkeypatch, temperature=0.05, n_action_samples=N_SAMPLES)
+    config = d3rlpy.algos.AWACConfig(**CONFIG, lam=0.05, n_action_samples=N_SAMPLES)
+    impl, modules, theirs = their_twin(config, model, batch)
+    modules.log_temp._parameter.data.fill_(-th.inf)
+    following, own = th.rand(64, N_ACTIONS) * 2 - 1, th.rand(64, N_SAMPLES, N_ACTIONS) * 2 - 1
+    monkeypatch.setattr(model.actor, "sample", lambda _, n=None: (following if n is None else own, None))
+    monkeypatch.setattr(SquashedGaussianDistribution, "sample_with_log_prob", lambda _: (following, th.ones(64, 1)))
+    monkeypatch.setattr(GaussianDistribution, "sample_n", lambda _, n: own)
+    model.learn(1, log_interval=None)
+
+    critic = impl.compute_critic_loss(theirs, impl.compute_target(theirs))
+    assert losses[0] == pytest.approx(critic.critic_loss.item(), rel=1e-5)
+    weights = impl._compute_weights(theirs.observations, theirs.actions)
+    assert weights.min() < 0.5 and weights.max() > 2
+    fit = -model.actor.regression_loss(theirs.observations, batch.actions).detach().unsqueeze(1)
+    monkeypatch.setattr(GaussianDistribution, "log_prob", lambda *_: fit)
+    actor = impl.compute_actor_loss(theirs, modules.policy(theirs.observations))
+    assert losses[1] == pytest.approx(actor.actor_loss.item() / 64, rel=1e-5)

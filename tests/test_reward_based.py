@@ -10,7 +10,8 @@ from data_files import ACTIONS, make_episode, make_observations, write_dataset
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_offline import CQL, DCQL, IQL, ORIL
+from sb3_offline import AWAC, CQL, DCQL, IQL, ORIL
+from sb3_offline.awac.losses import sampled_advantages, softmax_weights
 from sb3_offline.common.losses import bellman_loss, expectile_loss
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.cql.losses import conservative_gaps
@@ -68,6 +69,15 @@ def test_bellman_expectile_and_weights():
     expected = np.minimum(np.exp(3 * targets), 5)
     np.testing.assert_allclose(advantage_weights(tensor(targets), 3.0, 5.0), expected, rtol=1e-5)
     assert advantage_weights(th.tensor([1e6]), 3.0, 100.0).item() == pytest.approx(100.0)
+
+
+def test_awac_weights_are_normalised_over_the_batch():
+    data, policy = RNG.normal(size=(2, 64)), RNG.normal(size=(2, 64, 5))
+    advantages = data.min(axis=0) - policy.min(axis=0).mean(axis=1)
+    np.testing.assert_allclose(sampled_advantages(tensor(data), tensor(policy)), advantages, rtol=1e-5, atol=1e-6)
+    expected = np.exp(advantages / 0.3) / np.exp(advantages / 0.3).mean()
+    np.testing.assert_allclose(softmax_weights(tensor(advantages), 0.3), expected, rtol=1e-5)
+    assert softmax_weights(th.tensor([1e6, 0.0]), 0.3).tolist() == [2.0, 0.0]
 
 
 @pytest.mark.parametrize("eta", [None, 0.5])
@@ -141,6 +151,31 @@ def test_learned_coefficients_move_towards_their_goals_and_are_saved(folder, tmp
     assert CQL("MlpPolicy", None, path).target_entropy == -2
     with pytest.raises(TypeError, match="ent_coef is 'automatic'"):
         CQL("MlpPolicy", None, path, ent_coef="automatic")
+
+
+@pytest.mark.parametrize("policy, name", [("MlpPolicy", "states"), ("CnnPolicy", "images"), ("MultiInputPolicy", "both")])
+@pytest.mark.parametrize("algorithm", [AWAC])
+def test_mixed_precision_learns_as_float32_does(algorithm, policy, name, folder):
+    losses = []
+    for mixed_precision in (False, True):
+        kwargs = {"net_arch": [16, 16], "mixed_precision": mixed_precision}
+        model = algorithm(policy, None, folder / f"{name}.h5", batch_size=64, seed=0, policy_kwargs=kwargs)
+        model.learn(4, log_interval=None)
+        assert all(p.dtype == th.float32 and p.isfinite().all() for p in model.policy.parameters())
+        losses.append([float(model._metrics[loss][0]) for loss in ("critic_loss", "actor_loss")])
+    assert losses[0] != losses[1] and losses[1] == pytest.approx(losses[0], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs", "problem"),
+    [
+        (AWAC, {"temperature": 0}, "AWAC: temperature is 0; give a number above 0"),
+        (AWAC, {"n_action_samples": 0}, "AWAC: n_action_samples is 0; give a whole number of at least 1"),
+    ],
+)
+def test_hyperparameters_of_awac_without_sense_are_refused(algorithm, kwargs, problem, folder):
+    with pytest.raises(TypeError, match=problem):
+        algorithm("MlpPolicy", None, folder / "states.h5", **kwargs)
 
 
 # ------------------------------------------------------------------------ rewards

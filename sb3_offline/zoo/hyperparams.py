@@ -42,6 +42,7 @@ _CQL = {**_BOOTSTRAPPING, "cql_alpha": _log(0.05, 20)}
 
 #: By algorithm: names of hyperparameters, and what to suggest for each.
 SPACES: dict[str, dict[str, Suggestion]] = {
+    "awac": {**_BOOTSTRAPPING, "temperature": _log(0.1, 10), "n_action_samples": _choice(1, 4, 10)},
     "bc": {**_LEARNING, "loss": _choice("mse", "log_prob")},
     "ceborl": {
         **_BOOTSTRAPPING,
