@@ -12,6 +12,7 @@ from sb3_offline.dcql import DCQL
 from sb3_offline.iql import IQL
 from sb3_offline.oril import ORIL
 from sb3_offline.rce import RCE
+from sb3_offline.rebrac import ReBRAC
 from sb3_offline.td3_bc import TD3BC
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
@@ -26,6 +27,7 @@ ALGOS: dict[str, type[OfflineAlgorithm]] = {
     "iql": IQL,
     "oril": ORIL,
     "rce": RCE,
+    "rebrac": ReBRAC,
     "td3_bc": TD3BC,
 }
 
@@ -41,5 +43,6 @@ __all__ = [
     "RCE",
     "TD3BC",
     "OfflineAlgorithm",
+    "ReBRAC",
     "__version__",
 ]

@@ -109,7 +109,7 @@ def _collect(parser: argparse.ArgumentParser) -> Callable:
 
 
 def _train(parser: argparse.ArgumentParser) -> Callable:
-    parser.add_argument("--algo", default="ceborl", help="awac, bc, ceborl, cql, dcql, iql, oril, rce or td3_bc")
+    parser.add_argument("--algo", default="ceborl", help="awac, bc, ceborl, cql, dcql, iql, oril, rce, rebrac or td3_bc")
     parser.add_argument("--env", default=ENV_ID)
     parser.add_argument("--task", help="of the multimodal environment, e.g. door-open")
     parser.add_argument("--config", help="a shipped config's name or a YAML file (default: the algorithm's)")

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from point_mass import GOALS, goal_examples, write_point_mass
 
-from sb3_offline import AWAC, BC, CEBORL, CQL, DCQL, IQL, ORIL, TD3BC
+from sb3_offline import AWAC, BC, CEBORL, CQL, DCQL, IQL, ORIL, TD3BC, ReBRAC
 from sb3_offline.experiment.evaluation import evaluate_success
 
 SMALL = {"net_arch": [64, 64]}
@@ -42,6 +42,7 @@ def closeness(batch):
         (IQL, {"reward_fn": closeness}),
         (TD3BC, {"reward_fn": closeness, "learning_rate": 1e-3}),
         (AWAC, {"reward_fn": closeness, "batch_size": 256, "temperature": 0.3}),
+        (ReBRAC, {"reward_fn": closeness, "batch_size": 256}),
         (DCQL, {"examples": goal_examples(), "n_action_samples": 4}),
         (ORIL, {"examples": goal_examples(), "n_action_samples": 4, "reward_steps": 200}),
     ],

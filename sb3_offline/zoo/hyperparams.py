@@ -62,6 +62,7 @@ SPACES: dict[str, dict[str, Suggestion]] = {
         "positive_prior": _choice(None, 0.1, 0.3, 0.5),
     },
     "rce": {**_BOOTSTRAPPING, "ent_coef": _log(1e-5, 0.1), "example_share": _uniform(0, 0.1)},
+    "rebrac": {**_BOOTSTRAPPING, "actor_bc_coef": _log(1e-3, 1), "critic_bc_coef": _log(1e-4, 1)},
     "td3_bc": {
         **_BOOTSTRAPPING,
         "alpha": _log(0.5, 10),
