@@ -15,8 +15,8 @@ from sb3_offline.data.reader import DatasetSource
 
 class AWAC(RewardBasedAlgorithm):
     """
-    Advantage Weighted Actor-Critic (AWAC, https://arxiv.org/abs/2006.09359): the policy imitates the dataset's actions, each
-    weighted by how much better than the policy's own the critics think it is::
+    Advantage Weighted Actor-Critic (AWAC, https://arxiv.org/abs/2006.09359): the policy imitates the dataset's actions. An
+    action weighs more, the further its value lies above that of the policy's own actions::
 
         y = r + gamma (1 - terminated) min_i Qbar_i(s', a'),    a' ~ pi(s')
         critic:  min  sum_i E_D[(Q_i(s, a) - y)^2]

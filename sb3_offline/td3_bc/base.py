@@ -17,9 +17,9 @@ from sb3_offline.td3_bc.policies import CnnPolicy, DeterministicActor, MlpPolicy
 
 class OfflineTD3(RewardBasedAlgorithm):
     """
-    The base for algorithms that update as TD3 does: a deterministic policy that is updated after the critics, once in some
-    gradient steps; a target of the policy too; and noise on the target's actions. A subclass says what the actor's loss is,
-    in :meth:`_actor_loss`.
+    The base for algorithms that update as TD3 does. The policy is deterministic and is updated less often than the critics.
+    It has a target network too, whose actions get noise. A subclass defines the actor's loss (``_actor_loss``), and may change
+    the values that the critics' targets are made of (``_target_values``).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
