@@ -30,6 +30,8 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "rce": {"10 steps": {"n_steps": 10, "example_share": 0.02}},
     "cql": {"learned alpha": {"cql_alpha": "auto", "n_steps": 3}},
     "iql": {"3 steps": {"n_steps": 3}},
+    "awac": {"4 samples": {"n_action_samples": 4, "n_steps": 3}},
+    "rebrac": {"3 steps": {"n_steps": 3}},
     "td3_bc": {"own encoder": {"policy_kwargs": {"share_features_extractor": False}}},
     "oril": {"unlabelled": {"positive_prior": 0.3}},
     "dcql": {"mse": {"distance": "mse"}},

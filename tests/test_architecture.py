@@ -21,7 +21,7 @@ FLOORS = [
     ["cli"],
 ]
 #: Algorithms that build on another one
-BUILT_ON = {"rce": {"ceborl"}, "dcql": {"cql"}, "oril": {"cql"}}
+BUILT_ON = {"rce": {"ceborl"}, "dcql": {"cql"}, "oril": {"cql"}, "rebrac": {"td3_bc"}}
 
 
 def modules() -> dict[str, Path]:

@@ -1,5 +1,5 @@
 """
-CQL, IQL and TD3+BC against d3rlpy: the same weights, batch and noise give the same losses.
+AWAC, CQL, IQL, ReBRAC and TD3+BC against d3rlpy: the same weights, batch and noise give the same losses.
 
 Where the conventions differ, the tests say how:
 
@@ -8,6 +8,9 @@ Where the conventions differ, the tests say how:
 - d3rlpy's loss of the entropy coefficient has the coefficient where SB3's has its logarithm: Adam's first step is the same.
 - IQL's policy is a Gaussian around tanh(mean) there; ours is squashed, fitted by squared error. The weights are the same.
 - SB3 adds 1e-6 inside of the logarithm of a squashed Gaussian's density.
+- AWAC's policy is a Gaussian around tanh(mean) there, as IQL's. Its target has an entropy term, with a coefficient of 1, which
+  neither the paper nor the authors' code has. Its actor's loss is a sum over the batch; ours, as the authors', is a mean.
+- A LayerNorm stands behind the activation there, and in front of it here.
 """
 
 import numpy as np
@@ -16,7 +19,7 @@ import torch as th
 from data_files import ACTIONS, write_dataset
 from gymnasium import spaces
 
-from sb3_offline import CQL, IQL, TD3BC
+from sb3_offline import AWAC, CQL, IQL, TD3BC, ReBRAC
 
 d3rlpy = pytest.importorskip("d3rlpy", reason="see CONTRIBUTING.md for how to install it")
 
@@ -55,8 +58,8 @@ def make(algorithm, dataset, monkeypatch, **kwargs):
 
 
 def copy_weights(source, target):
-    """Linear layers in their order."""
-    layers = [[m for m in module.modules() if isinstance(m, th.nn.Linear)] for module in (source, target)]
+    """Linear and normalising layers in their order."""
+    layers = [[m for m in module.modules() if isinstance(m, th.nn.Linear | th.nn.LayerNorm)] for module in (source, target)]
     for ours, theirs in zip(*layers, strict=True):
         theirs.load_state_dict(ours.state_dict())
 
@@ -76,7 +79,7 @@ def their_twin(config, model, batch):
         actions=batch.actions,
         rewards=batch.rewards,
         next_observations=following,
-        next_actions=batch.actions,
+        next_actions=batch.actions if batch.next_actions is None else batch.next_actions,
         returns_to_go=batch.rewards,
         terminals=batch.dones,
         intervals=th.ones_like(batch.rewards),
@@ -175,6 +178,65 @@ def test_td3_bc(dataset, monkeypatch):
         parameter.add_(0.1 * th.randn_like(parameter))
     config = d3rlpy.algos.TD3PlusBCConfig(**CONFIG, alpha=1.5, target_smoothing_sigma=0.3, target_smoothing_clip=0.4)
     impl, modules, theirs = their_twin(config, model, batch)
+    copy_weights(model.actor, modules.policy)
+    copy_weights(model.actor_target, modules.targ_policy)
+    noise = th.randn(64, N_ACTIONS)
+    monkeypatch.setattr(th, "randn_like", lambda _: noise)
+    monkeypatch.setattr(th, "randn", lambda *_, **__: noise)
+    targets = impl.compute_target(theirs)
+    model.learn(1, log_interval=None)
+    assert len(losses) == 1  # the policy is delayed
+    model._n_updates = model.policy_delay - 1
+    model.learn(1, log_interval=None)
+    assert losses[1] == losses[0] == pytest.approx(impl.compute_critic_loss(theirs, targets).critic_loss.item(), rel=1e-5)
+    actor = impl.compute_actor_loss(theirs, modules.policy(theirs.observations))
+    assert losses[2] == pytest.approx(actor.actor_loss.item(), rel=1e-5)
+
+
+def test_awac(dataset, monkeypatch):
+    from d3rlpy.models.torch.distributions import GaussianDistribution, SquashedGaussianDistribution
+
+    model, batch, losses = make(AWAC, dataset, monkeypatch, temperature=0.05, n_action_samples=N_SAMPLES)
+    config = d3rlpy.algos.AWACConfig(**CONFIG, lam=0.05, n_action_samples=N_SAMPLES)
+    impl, modules, theirs = their_twin(config, model, batch)
+    modules.log_temp._parameter.data.fill_(-th.inf)
+    following, own = th.rand(64, N_ACTIONS) * 2 - 1, th.rand(64, N_SAMPLES, N_ACTIONS) * 2 - 1
+    monkeypatch.setattr(model.actor, "sample", lambda _, n=None: (following if n is None else own, None))
+    monkeypatch.setattr(SquashedGaussianDistribution, "sample_with_log_prob", lambda _: (following, th.ones(64, 1)))
+    monkeypatch.setattr(GaussianDistribution, "sample_n", lambda _, n: own)
+    model.learn(1, log_interval=None)
+
+    critic = impl.compute_critic_loss(theirs, impl.compute_target(theirs))
+    assert losses[0] == pytest.approx(critic.critic_loss.item(), rel=1e-5)
+    weights = impl._compute_weights(theirs.observations, theirs.actions)
+    assert weights.min() < 0.5 and weights.max() > 2
+    fit = -model.actor.regression_loss(theirs.observations, batch.actions).detach().unsqueeze(1)
+    monkeypatch.setattr(GaussianDistribution, "log_prob", lambda *_: fit)
+    actor = impl.compute_actor_loss(theirs, modules.policy(theirs.observations))
+    assert losses[1] == pytest.approx(actor.actor_loss.item() / 64, rel=1e-5)
+
+
+def test_rebrac(dataset, monkeypatch):
+    options = {"actor_bc_coef": 0.3, "critic_bc_coef": 0.2, "target_policy_noise": 0.3, "target_noise_clip": 0.4}
+    model, _, losses = make(ReBRAC, dataset, monkeypatch, **options)
+    batch = model._sample_batch(64)
+    assert 0 < batch.dones.sum() < 64
+    monkeypatch.setattr(model, "_sample_batch", lambda _: batch)
+    for parameter in model.actor_target.mu.parameters():
+        parameter.add_(0.1 * th.randn_like(parameter))
+    config = d3rlpy.algos.ReBRACConfig(
+        actor_encoder_factory=ENCODER,
+        critic_encoder_factory=d3rlpy.models.VectorEncoderFactory([16, 16], use_layer_norm=True),
+        gamma=GAMMA,
+        actor_beta=0.3,
+        critic_beta=0.2,
+        target_smoothing_sigma=0.3,
+        target_smoothing_clip=0.4,
+    )
+    impl, modules, theirs = their_twin(config, model, batch)
+    for function in (*modules.q_funcs, *modules.targ_q_funcs):
+        linear, activation, norm, *others = function._encoder._layers
+        function._encoder._layers = th.nn.Sequential(linear, norm, activation, others[0], others[2], others[1])
     copy_weights(model.actor, modules.policy)
     copy_weights(model.actor_target, modules.targ_policy)
     noise = th.randn(64, N_ACTIONS)

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from point_mass import GOALS, goal_examples, write_point_mass
 
-from sb3_offline import BC, CEBORL, CQL, DCQL, IQL, ORIL, TD3BC
+from sb3_offline import AWAC, BC, CEBORL, CQL, DCQL, IQL, ORIL, TD3BC, ReBRAC
 from sb3_offline.experiment.evaluation import evaluate_success
 
 SMALL = {"net_arch": [64, 64]}
@@ -41,6 +41,8 @@ def closeness(batch):
         (CQL, {"reward_fn": closeness, "learning_rate": 1e-3, "cql_alpha": 1.0, "ent_coef": 1e-3, "n_action_samples": 4}),
         (IQL, {"reward_fn": closeness}),
         (TD3BC, {"reward_fn": closeness, "learning_rate": 1e-3}),
+        (AWAC, {"reward_fn": closeness, "batch_size": 256, "temperature": 0.3}),
+        (ReBRAC, {"reward_fn": closeness, "batch_size": 256}),
         (DCQL, {"examples": goal_examples(), "n_action_samples": 4}),
         # The prior and the larger penalty make it reach the goal with every seed; with its defaults one seed in three does
         (

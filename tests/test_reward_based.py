@@ -10,7 +10,8 @@ from data_files import ACTIONS, make_episode, make_observations, write_dataset
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_offline import CQL, DCQL, IQL, ORIL
+from sb3_offline import AWAC, CQL, DCQL, IQL, ORIL, ReBRAC
+from sb3_offline.awac.losses import sampled_advantages, softmax_weights
 from sb3_offline.common.losses import bellman_loss, expectile_loss
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.cql.losses import conservative_gaps
@@ -18,6 +19,7 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.iql.losses import exponential_weights
 from sb3_offline.oril.losses import classifier_loss
+from sb3_offline.rebrac.losses import penalized_actor_loss, penalized_values, squared_distances
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -68,6 +70,28 @@ def test_bellman_expectile_and_weights():
     expected = np.minimum(np.exp(3 * targets), 5)
     np.testing.assert_allclose(exponential_weights(tensor(targets), 3.0, 5.0), expected, rtol=1e-5)
     assert exponential_weights(th.tensor([1e6]), 3.0, 100.0).item() == pytest.approx(100.0)
+
+
+def test_awac_weights_are_normalised_over_the_batch():
+    data, policy = RNG.normal(size=(2, 64)), RNG.normal(size=(2, 64, 5))
+    advantages = data.min(axis=0) - policy.min(axis=0).mean(axis=1)
+    np.testing.assert_allclose(sampled_advantages(tensor(data), tensor(policy)), advantages, rtol=1e-5, atol=1e-6)
+    expected = np.exp(advantages / 0.3) / np.exp(advantages / 0.3).mean()
+    np.testing.assert_allclose(softmax_weights(tensor(advantages), 0.3), expected, rtol=1e-5)
+    assert softmax_weights(th.tensor([1e6, 0.0]), 0.3).tolist() == [2.0, 0.0]
+
+
+def test_rebrac_penalties_of_critics_and_actor():
+    values, actions, data_actions = RNG.normal(size=64), RNG.uniform(-1, 1, (64, 3)), RNG.uniform(-1, 1, (64, 3))
+    squares = ((actions - data_actions) ** 2).sum(axis=1)
+    distances = squared_distances(tensor(actions), tensor(data_actions))
+    np.testing.assert_allclose(distances, squares, rtol=1e-5)
+    np.testing.assert_allclose(penalized_values(tensor(values), distances, 0.3), values - 0.3 * squares, rtol=1e-5, atol=1e-6)
+    v = tensor(values).requires_grad_()
+    loss = penalized_actor_loss(v, distances, 0.3)
+    assert loss.item() == pytest.approx((0.3 * squares - values / np.abs(values).mean()).mean(), rel=1e-5)
+    loss.backward()  # the scale of the values has no gradient
+    np.testing.assert_allclose(v.grad, np.full(64, -1 / 64 / np.abs(values).mean()), rtol=1e-5)
 
 
 @pytest.mark.parametrize("eta", [None, 0.5])
@@ -140,6 +164,68 @@ def test_learned_coefficients_move_towards_their_goals_and_are_saved(folder, tmp
     assert CQL("MlpPolicy", None, path).target_entropy == -2
     with pytest.raises(TypeError, match="ent_coef is 'automatic'"):
         CQL("MlpPolicy", None, path, ent_coef="automatic")
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rebrac_leaves_out_steps_without_a_next_action_and_finds_that_of_the_others(n_steps, folder):
+    model = ReBRAC("MlpPolicy", None, folder / "states.h5", n_steps=n_steps, critic_bc_coef=0.5, seed=0, policy_kwargs=SMALL)
+    actions, wanted, start = model.replay_buffer.actions, {}, 0
+    for episode in map(partial(make_episode, space=STATES), range(12)):
+        last = start + len(episode["actions"]) - 1
+        wanted |= {step: actions[min(step + n_steps, last)] for step in range(start, last)}
+        if episode["terminated"][-1]:
+            wanted[last] = None  # nothing is bootstrapped from
+        start = last + 1
+    assert 0 < sum(action is None for action in wanted.values()) and len(wanted) < start
+
+    batch = model._sample_batch(5000)
+    assert set(batch.steps.tolist()) == wanted.keys()
+    policy_actions, values = th.rand(5000, 2) * 2 - 1, th.randn(5000)
+    got = double(values - model._target_values(values, policy_actions, batch))
+    for step, action, penalty in zip(batch.steps.tolist(), double(policy_actions), got, strict=True):
+        if wanted[step] is not None:
+            assert penalty == pytest.approx(0.5 * ((action - wanted[step]) ** 2).sum(), rel=1e-4, abs=1e-6)
+
+
+def test_rebrac_says_where_the_steps_without_a_next_action_are_all_that_counts(tmp_path):
+    for length, rewards in ((4, [0, 0, 0, 1]), (1, [1])):
+        with DatasetWriter(tmp_path / f"{length}.h5", STATES, ACTIONS, success=False) as writer:
+            for _ in range(3):
+                observations = make_observations(STATES, length + 1, RNG)
+                writer.add_episode(observations, np.stack([ACTIONS.sample() for _ in range(length)]), rewards=rewards)
+    with pytest.warns(UserWarning, match=r"4\.h5: rewards: all of them are 0 but those of truncated episodes' last steps"):
+        ReBRAC("MlpPolicy", None, tmp_path / "4.h5", policy_kwargs=SMALL).learn(1)
+    with pytest.raises(DatasetError, match=r"1\.h5: episodes/length: are all 1"):
+        ReBRAC("MlpPolicy", None, tmp_path / "1.h5", policy_kwargs=SMALL).learn(1)
+
+
+@pytest.mark.parametrize("policy, name", [("MlpPolicy", "states"), ("CnnPolicy", "images"), ("MultiInputPolicy", "both")])
+@pytest.mark.parametrize("algorithm", [AWAC, ReBRAC])
+def test_mixed_precision_learns_as_float32_does(algorithm, policy, name, folder):
+    losses = []
+    for mixed_precision in (False, True):
+        kwargs = {"net_arch": [16, 16], "mixed_precision": mixed_precision}
+        model = algorithm(policy, None, folder / f"{name}.h5", batch_size=64, seed=0, policy_kwargs=kwargs)
+        model.learn(4, log_interval=None)
+        assert all(p.dtype == th.float32 and p.isfinite().all() for p in model.policy.parameters())
+        losses.append([float(model._metrics[loss][0]) for loss in ("critic_loss", "actor_loss")])
+    assert losses[0] != losses[1] and losses[1] == pytest.approx(losses[0], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs", "problem"),
+    [
+        (AWAC, {"temperature": 0}, "AWAC: temperature is 0; give a number above 0"),
+        (AWAC, {"n_action_samples": 0}, "AWAC: n_action_samples is 0; give a whole number of at least 1"),
+        (ReBRAC, {"critic_bc_coef": -1}, "ReBRAC: critic_bc_coef is -1; give a number of at least 0"),
+        (ReBRAC, {"actor_bc_coef": "high"}, "ReBRAC: actor_bc_coef is 'high'"),
+        (ReBRAC, {"policy_delay": 0}, "ReBRAC: policy_delay is 0"),
+        (ReBRAC, {"alpha": 2.5}, "unexpected keyword argument 'alpha'"),
+    ],
+)
+def test_hyperparameters_of_awac_and_rebrac_without_sense_are_refused(algorithm, kwargs, problem, folder):
+    with pytest.raises(TypeError, match=problem):
+        algorithm("MlpPolicy", None, folder / "states.h5", **kwargs)
 
 
 # ------------------------------------------------------------------------ rewards

@@ -192,8 +192,9 @@ def test_shipped_configs_mean_the_same_to_rl_zoo3(name, run, monkeypatch):
     theirs, ours = models[0], create_model(algo, {**config, **few})
 
     assert theirs.policy_class is ours.policy_class and theirs.observation_space == ours.observation_space
-    settings = (config.keys() | {"examples"}) - {"policy", "n_timesteps", "env_kwargs", "episodes", "dataset"}
-    for key in settings:
+    assert theirs.lr_schedule(1) == ours.lr_schedule(1)  # rl_zoo3 makes a schedule of a number
+    others = {"policy", "n_timesteps", "env_kwargs", "episodes", "dataset", "learning_rate"}
+    for key in (config.keys() | {"examples"}) - others:
         assert getattr(theirs, key, None) == getattr(ours, key, None), key
     for key in ("actions", "rewards"):
         np.testing.assert_allclose(getattr(theirs.replay_buffer, key), getattr(ours.replay_buffer, key), rtol=1e-5)

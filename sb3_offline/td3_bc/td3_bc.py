@@ -6,18 +6,16 @@ from typing import Any, ClassVar, Literal
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, Constraints
-from sb3_offline.common.losses import bellman_loss
-from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
+from sb3_offline.common.hyperparameters import NOT_NEGATIVE, Constraints
+from sb3_offline.common.reward_based import RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform, UniformInt, log_uniform
 from sb3_offline.data.reader import DatasetSource
-from sb3_offline.td3_bc.policies import CnnPolicy, DeterministicActor, MlpPolicy, MultiInputPolicy, TD3BCPolicy
+from sb3_offline.td3_bc.base import OfflineTD3
 
 
-class TD3BC(RewardBasedAlgorithm):
+class TD3BC(OfflineTD3):
     """
     TD3+BC (https://arxiv.org/abs/2106.06860) is TD3 with an actor that also imitates the dataset::
 
@@ -50,26 +48,13 @@ class TD3BC(RewardBasedAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
-    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
-        "alpha": [NOT_NEGATIVE],
-        "policy_delay": [COUNT],
-        "target_policy_noise": [NOT_NEGATIVE],
-        "target_noise_clip": [NOT_NEGATIVE],
-    }
+    _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {"alpha": [NOT_NEGATIVE]}
     search_space: ClassVar[SearchSpace] = {
         **BOOTSTRAPPING,
         "alpha": log_uniform(0.5, 10),
         "policy_delay": UniformInt(1, 3),
         "target_policy_noise": Uniform(0, 0.5),
     }
-    policy: TD3BCPolicy
-    actor: DeterministicActor  # type: ignore[assignment]
-    actor_target: DeterministicActor
 
     def __init__(
         self,
@@ -101,6 +86,9 @@ class TD3BC(RewardBasedAlgorithm):
             env,
             dataset,
             reward_fn,
+            policy_delay,
+            target_policy_noise,
+            target_noise_clip,
             learning_rate=learning_rate,
             batch_size=batch_size,
             tau=tau,
@@ -116,65 +104,12 @@ class TD3BC(RewardBasedAlgorithm):
             seed=seed,
         )
         self.alpha = alpha
-        self.policy_delay = policy_delay
-        self.target_policy_noise = target_policy_noise
-        self.target_noise_clip = target_noise_clip
 
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_model(self) -> None:
-        self.target_update_interval = self.policy_delay  # also of a model that is loaded with another one
-        super()._setup_model()
-
-    def _create_aliases(self) -> None:
-        super()._create_aliases()
-        self.actor_target = self.policy.actor_target
-
-    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
-        self.policy.set_training_mode(True)
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-
-        for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            observations = self.augment(batch.observations)
-            features = self.critic.encode(observations)
-            with th.no_grad():
-                rewards, discounts, next_observations = self._returns(batch)
-                next_features = self.critic_target.encode(next_observations)
-                shared = self.policy.share_features_extractor
-                next_actions = self.actor_target.act(next_features if shared else self.actor_target.encode(next_observations))
-                noise = self._target_noise(next_actions)
-                next_values = self.critic_target.values(next_features, (next_actions + noise).clamp(-1, 1))
-                targets = rewards + discounts * next_values.amin(dim=0)
-
-            values = self.critic.values(features, batch.actions)
-            critic_loss = bellman_loss(values, targets)
-            self._optimize(self.critic.optimizer, critic_loss)
-            self._record(critic_loss=critic_loss, values_data=values.mean())
-
-            self._n_updates += 1
-            if self._n_updates % self.policy_delay == 0:
-                actions = self.actor.act(self._policy_features(observations, features))
-                policy_values = self._values_of_policy(features, actions)[0]
-                imitation_loss = F.mse_loss(actions, batch.actions)
-                actor_loss = imitation_loss - self.alpha / policy_values.abs().mean().detach() * policy_values.mean()
-                self._optimize(self.actor.optimizer, actor_loss)
-                self._record(actor_loss=actor_loss, imitation_loss=imitation_loss, values_policy=policy_values.mean())
-            self._update_target()
-
-    def _target_noise(self, actions: th.Tensor) -> th.Tensor:
-        """:return: like ``actions``: noise that smooths the target over similar actions"""
-        noise = self.target_policy_noise * th.randn_like(actions)
-        return noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-
-    def _update_target(self) -> None:
-        super()._update_target()
-        if self._n_updates % self.policy_delay == 0:
-            # The target of a shared encoder is the critic's, which is updated already.
-            heads = (m if not self.policy.share_features_extractor else m.mu for m in (self.actor, self.actor_target))
-            source, target = (head.parameters() for head in heads)
-            polyak_update(source, target, self.tau)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor_target"]
+    def _actor_loss(self, values: th.Tensor, actions: th.Tensor, data_actions: th.Tensor) -> th.Tensor:
+        policy_values = values[0]
+        imitation_loss = F.mse_loss(actions, data_actions)
+        self._record(imitation_loss=imitation_loss, values_policy=policy_values.mean())
+        return imitation_loss - self.alpha / policy_values.abs().mean().detach() * policy_values.mean()
