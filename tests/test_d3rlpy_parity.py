@@ -79,7 +79,7 @@ def their_twin(config, model, batch):
         actions=batch.actions,
         rewards=batch.rewards,
         next_observations=following,
-        next_actions=batch.actions if batch.next_actions is None else batch.next_actions,
+        next_actions=batch.actions if batch.horizons[0].next_actions is None else batch.horizons[0].next_actions,
         returns_to_go=batch.rewards,
         terminals=batch.dones,
         intervals=th.ones_like(batch.rewards),

@@ -179,10 +179,10 @@ def test_rebrac_leaves_out_steps_without_a_next_action_and_finds_that_of_the_oth
     assert 0 < sum(action is None for action in wanted.values()) and len(wanted) < start
 
     batch = model._sample_batch(5000)
-    assert set(batch.steps.tolist()) == wanted.keys()
+    assert set(batch.indices.tolist()) == wanted.keys()
     policy_actions, values = th.rand(5000, 2) * 2 - 1, th.randn(5000)
     got = double(values - model._target_values(values, policy_actions, batch))
-    for step, action, penalty in zip(batch.steps.tolist(), double(policy_actions), got, strict=True):
+    for step, action, penalty in zip(batch.indices.tolist(), double(policy_actions), got, strict=True):
         if wanted[step] is not None:
             assert penalty == pytest.approx(0.5 * ((action - wanted[step]) ** 2).sum(), rel=1e-4, abs=1e-6)
 
