@@ -1,4 +1,4 @@
-"""What callbacks share."""
+"""Logging from callbacks."""
 
 from collections.abc import Mapping
 
@@ -7,10 +7,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 def log_at_once(callback: BaseCallback, values: Mapping[str, float]) -> None:
     """
-    Log values under the present step. Left to the next dump, they would stand under a later step, or be overwritten before it.
+    Log values under the present step. With the next regular dump they would appear under a later step, or be overwritten.
 
-    :param callback: whose
-    :param values: by their names
+    :param callback: the callback that logs
+    :param values: values by name
     """
     for name, value in values.items():
         callback.logger.record(name, value)

@@ -1,4 +1,4 @@
-"""Losses that several algorithms share, as plain functions."""
+"""Losses of several algorithms, as plain functions of tensors."""
 
 import torch as th
 
@@ -7,7 +7,7 @@ def bellman_loss(values: th.Tensor, targets: th.Tensor) -> th.Tensor:
     """
     ``sum_i E_D[(Q_i(s, a) - y)^2]``.
 
-    :param values: of dataset actions, ``(n_critics, batch)``
+    :param values: values of the dataset's actions, ``(n_critics, batch)``
     :param targets: y, no gradient, ``(batch,)``
     :return: scalar, summed over the critics
     """
@@ -16,7 +16,7 @@ def bellman_loss(values: th.Tensor, targets: th.Tensor) -> th.Tensor:
 
 def expectile_loss(errors: th.Tensor, expectile: float) -> th.Tensor:
     """
-    ``E_D[|expectile - 1(u < 0)| u^2]``: minimal where the prediction is the expectile of the targets.
+    ``E_D[|expectile - 1(u < 0)| u^2]``, which is minimal if the prediction is the expectile of the targets.
 
     :param errors: u, targets minus predictions, ``(batch,)``
     :param expectile: between 0 and 1; 0.5 gives the mean, 1 the maximum
@@ -28,6 +28,6 @@ def expectile_loss(errors: th.Tensor, expectile: float) -> th.Tensor:
 def effective_share(weights: th.Tensor) -> th.Tensor:
     """
     :param weights: ``(n,)``, positive
-    :return: scalar, the part of the weights that would carry as much if all were the same
+    :return: scalar, the share of the weights that would carry as much if all were equal
     """
     return weights.sum() ** 2 / weights.pow(2).sum() / len(weights)

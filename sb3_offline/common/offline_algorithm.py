@@ -1,4 +1,4 @@
-"""The base of all algorithms: SB3's off-policy class, fed by a dataset instead of an environment."""
+"""The base of all algorithms: SB3's off-policy class, which draws batches from a dataset instead of an environment."""
 
 import sys
 import time

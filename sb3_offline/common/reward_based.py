@@ -19,16 +19,16 @@ RewardFunction = Callable[[OfflineSamples], Any] | str
 
 class RewardBasedAlgorithm(ActorCriticAlgorithm):
     """
-    The base for algorithms that learn from rewards: the dataset's, or others that take their place.
+    The base for algorithms that learn from rewards: the dataset's, or others in their place.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     :param dataset: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
-    :param reward_fn: a function or model that gives the rewards ``(batch,)`` of a batch of transitions, in place of the
-        dataset's. It is called once for each transition, when the dataset is opened, with an
-        :class:`~sb3_offline.data.buffer.OfflineSamples` (``observations``, ``actions`` scaled to [-1, 1],
-        ``next_observations``, ``dones``, ``rewards`` of the dataset, as tensors on the model's device), and is saved with
-        the model. ``"success"`` takes the dataset's success labels, 0 or 1, for rewards.
+    :param reward_fn: a function or model that returns the rewards ``(batch,)`` of a batch of transitions, in place of the
+        dataset's. It is called once for each transition, when the dataset is opened, and is saved with the model. Its
+        argument is an :class:`~sb3_offline.data.buffer.OfflineSamples` (``observations``, ``actions`` scaled to [-1, 1],
+        ``next_observations``, ``dones``, ``rewards`` of the dataset, as tensors on the model's device). ``"success"`` takes
+        the dataset's success labels, 0 or 1, as rewards.
     :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     """
 

@@ -1,4 +1,4 @@
-"""An environment that is only its spaces, for learners that were given none."""
+"""An environment that consists of its spaces only, for models without an environment."""
 
 from typing import Any, NoReturn
 
@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 class SpacesOnlyEnv(gym.Env):
     """
-    Stands in for the environment where a learner has only a dataset, so that SB3's callbacks find the spaces they ask for.
+    A stand-in for the environment of a model that has only a dataset, so that SB3 finds the spaces it needs.
 
     :param observation_space: Observation space
     :param action_space: Action space

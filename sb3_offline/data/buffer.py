@@ -103,7 +103,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             raise ValueError(f"n_steps is {n_steps}; windows have one step at least")
         datasets = open_datasets(dataset)
         n_steps_total = sum(d.n_steps for d in datasets)
-        # Not ReplayBuffer's constructor: it would allocate arrays for the transitions that we hold otherwise
+        # Not ReplayBuffer's constructor, which would allocate arrays for the transitions
         BaseBuffer.__init__(self, max(n_steps_total, 1), observation_space, action_space, device)
         self.full, self.optimize_memory_usage, self.handle_timeout_termination = True, False, False
         self.n_steps, self.gamma, self.next_actions = n_steps, gamma, next_actions
@@ -129,11 +129,11 @@ class OfflineReplayBuffer(ReplayBuffer):
         return np.concatenate([d.arrays[name] for d in self.datasets])
 
     def _index_steps(self, lengths: np.ndarray) -> None:
-        """For every step its row of observations and the number of steps left from it."""
+        """Compute for every step its row of observations and the number of steps that are left in its episode."""
         n, starts = int(lengths.sum()), np.cumsum(lengths) - lengths
         step = np.arange(n)
         self._observation_rows = step + np.repeat(np.arange(len(lengths)), lengths)
-        # Steps from each to the last one that a window may reach: 0 only where next actions end with the episode
+        # The number of steps that a window may go ahead: 0 only at last steps, if next actions are asked for
         self._steps_left = np.repeat(starts + lengths, lengths) - step - int(self.next_actions)
         if n == 0:
             raise DatasetError(
@@ -141,7 +141,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             )
 
     def _scaled_actions(self) -> np.ndarray:
-        """As SB3's buffers hold them: [-1, 1] of the space for a Box, integers otherwise."""
+        """:return: the actions as SB3's buffers hold them: scaled to [-1, 1] for a Box, integers otherwise"""
         actions = self._concatenate("actions").reshape(-1, self.action_dim)
         if not isinstance(self.action_space, spaces.Box):
             return actions
@@ -163,14 +163,14 @@ class OfflineReplayBuffer(ReplayBuffer):
         return np.clip(scaled, -1, 1).astype(np.float32)
 
     def size(self) -> int:
-        """:return: the number of steps that are sampled from"""
+        """:return: the number of steps to sample from"""
         return self.buffer_size
 
     def reset(self) -> None:
-        """Do nothing: the data are fixed."""
+        """Do nothing, since the data are fixed."""
 
     def add(self, *args: Any, **kwargs: Any) -> None:
-        """Raise: the data are fixed."""
+        """Raise ``DatasetError``, since the data are fixed."""
         remedy = "Collect new steps in a ReplayBuffer of their own, or write a dataset with DatasetWriter"
         raise DatasetError("", "OfflineReplayBuffer", "is read-only", remedy)
 
@@ -214,7 +214,7 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def single_steps(self) -> "OfflineReplayBuffer":
         """
-        :return: a buffer over the same arrays without windows and next actions: what followed an episode's last step is there
+        :return: a buffer over the same arrays, without windows and next actions, whose last steps have their true successors
         """
         other = object.__new__(type(self))  # a copy would read the files again
         other.__dict__.update(self.__dict__, n_steps=1, next_actions=False)
@@ -259,35 +259,35 @@ class OfflineReplayBuffer(ReplayBuffer):
         return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observations"]
 
     def _wrap(self, name: str, array: np.ndarray, space: spaces.Space) -> np.ndarray:
-        """Rows of a file in the layout and dtype of the learner's space; images turn channel-first as a view."""
+        """:return: rows of a file in the layout and dtype of the learner's space; images become channel-first as a view"""
         if name in self._transposed:
             return array.transpose(0, 3, 1, 2)
         return array.reshape(len(array), *_plain_shape(space)).astype(space.dtype, copy=False)
 
     def _to_device(self, array: np.ndarray) -> th.Tensor:
-        return th.as_tensor(array, device=self.device)  # no copy on the CPU: all arrays here are fresh
+        return th.as_tensor(array, device=self.device)  # no copy on the CPU, since all arrays here are new
 
     def _column(self, values: np.ndarray) -> th.Tensor:
         return self._to_device(values.astype(np.float32).reshape(-1, 1))
 
     @property
     def has_rewards(self) -> bool:
-        """Whether there are rewards: in the files, or others in their place."""
+        """True if there are rewards, in the files or in their place."""
         return self.is_relabelled or self.datasets[0].rewards is not None
 
     def restore_rewards(self) -> None:
-        """Take the rewards of the files again."""
+        """Go back to the rewards of the files."""
         self.rewards = self._file_rewards
 
     @property
     def is_relabelled(self) -> bool:
-        """Whether the rewards are others than those of the files."""
+        """True if the rewards are not those of the files."""
         return self.rewards is not self._file_rewards
 
     def success_rewards(self) -> np.ndarray:
         """
-        :return: (N,) float32, 1 for the steps after which the files' labels say success; raises ``DatasetError`` where they
-            hold none
+        :return: (N,) float32, 1 for the steps that the files label as successes; raises ``DatasetError`` if they hold no
+            labels
         """
         for dataset in self.datasets:
             if dataset.success is None:
@@ -298,15 +298,15 @@ class OfflineReplayBuffer(ReplayBuffer):
         self, reward_fn: Callable[[OfflineSamples], Any], env: VecNormalize | None = None, batch_size: int = 512
     ) -> None:
         """
-        Replace all rewards, in memory; the files stay as they are.
+        Replace all rewards in memory. The files stay unchanged.
 
-        :param reward_fn: gives the rewards (B,) of a batch of one-step transitions, as a tensor or an array; called without
-            gradients, once for each transition, in their order
-        :param env: normalises the observations that it sees
-        :param batch_size: transitions at a time
+        :param reward_fn: function that returns the rewards (B,) of a batch of one-step transitions, as a tensor or an array.
+            It is called without gradients, once for each transition, in their order
+        :param env: normalises the observations of the batches
+        :param batch_size: transitions in a batch
         """
         rewards = np.empty(self.buffer_size, np.float32)
-        n_steps, self.n_steps = self.n_steps, 1  # no windows: they would only read more frames
+        n_steps, self.n_steps = self.n_steps, 1  # no windows, which would only read more images
         try:
             for first in range(0, self.buffer_size, batch_size):
                 indices = np.arange(first, min(first + batch_size, self.buffer_size))
@@ -322,10 +322,10 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def return_variance(self, gamma: float) -> float:
         """
-        What ``VecNormalize`` scales rewards by: the variance of the discounted sum of the rewards up to each step.
+        Compute the variance by which ``VecNormalize`` scales rewards: that of the discounted sum of the rewards up to a step.
 
         :param gamma: discount factor of ``VecNormalize``
-        :return: over all steps
+        :return: the variance over all steps
         """
         lengths = np.concatenate([dataset.lengths for dataset in self.datasets])
         starts, returns = np.cumsum(lengths) - lengths, self.rewards.astype(np.float64)
@@ -336,10 +336,12 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def observation_statistics(self, keys: Sequence[str] | None = None) -> Any:
         """
-        Moments of all observations in the files, the last ones of episodes too, e.g. for ``VecNormalize.obs_rms``.
+        Compute the moments of all observations, including the last ones of episodes, for instance for
+        ``VecNormalize.obs_rms``.
 
-        :param keys: of a Dict space, those that are wanted (default: all)
-        :return: (mean, variance, count) with mean and variance float64 of the learner's shape; for a Dict space a dict of such
+        :param keys: keys of a Dict space (default: all)
+        :return: (mean, variance, count), with mean and variance float64 of the learner's shape; a dict of these for a Dict
+            space
         """
         plain = subspaces(self.observation_space, "observations")
         names = {n.removeprefix("observations/"): n for n in plain}
@@ -353,28 +355,28 @@ class OfflineReplayBuffer(ReplayBuffer):
             for first in range(0, len(part), rows):
                 piece = self._wrap(name, part[first : first + rows], space).astype(np.float64)
                 delta, total = piece.mean(axis=0) - mean, count + len(piece)
-                # Moments of two sets joined (Chan et al.): the sum of squares alone would cancel for far-off means
+                # Join the moments of two sets (Chan et al.). Plain sums of squares would cancel for means far from 0
                 squares = squares + ((piece - piece.mean(axis=0)) ** 2).sum(axis=0) + delta**2 * count * len(piece) / total
                 mean = mean + delta * len(piece) / total
                 count = total
         return mean, squares / count, count
 
     def checksum(self) -> int:
-        """:return: of all actions: it tells data apart that have as many steps"""
+        """:return: a checksum of all actions, an identifier of the data"""
         return zlib.crc32(self.actions.tobytes())
 
     def get_rng_state(self) -> dict[str, Any]:
-        """:return: the generator's state, for an exact resume"""
+        """:return: the state of the generator, for an exact resume"""
         return dict(self.rng.bit_generator.state)
 
     def set_rng_state(self, state: dict[str, Any]) -> None:
-        """:param state: what ``get_rng_state`` gave"""
+        """:param state: a state that ``get_rng_state`` returned"""
         self.rng.bit_generator.state = state
 
     def __getstate__(self) -> dict[str, Any]:
         options = {"n_steps": self.n_steps, "gamma": self.gamma, "storage": self.storage, "next_actions": self.next_actions}
         arguments = (self.datasets, self.observation_space, self.action_space, str(self.device))
-        rewards = self.rewards if self.is_relabelled else None  # relabelled ones are in no file
+        rewards = self.rewards if self.is_relabelled else None  # no file holds relabelled rewards
         return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state(), "rewards": rewards}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -384,19 +386,19 @@ class OfflineReplayBuffer(ReplayBuffer):
 
 
 def joined(batches: Sequence[Observations]) -> Observations:
-    """:return: one batch of all"""
+    """:return: the batches as one"""
     if isinstance(batches[0], dict):
         return {key: th.cat([batch[key] for batch in batches]) for key in batches[0]}  # type: ignore[index, call-overload]
     return th.cat(list(batches))  # type: ignore[arg-type]
 
 
 def _plain_shape(space: spaces.Space) -> tuple[int, ...]:
-    """:return: SB3's shape of one observation of a space that is not a Dict: (1,) for Discrete"""
+    """:return: SB3's shape of one observation of a plain space: (1,) for Discrete"""
     return get_obs_shape(space)  # type: ignore[return-value]
 
 
 def _match_observations(dataset: OfflineDataset, space: spaces.Space) -> set[str]:
-    """:return: names of the arrays that are channel-last images here and channel-first ones for the learner"""
+    """:return: names of the arrays of images that are channel-last in the files and channel-first for the learner"""
     stored, wanted = subspaces(dataset.observation_space, "observations"), subspaces(space, "observations")
     if stored.keys() != wanted.keys():
         problem = f"is {dataset.observation_space}, but the learner has {space}"
@@ -410,7 +412,7 @@ def _match_observations(dataset: OfflineDataset, space: spaces.Space) -> set[str
         elif isinstance(part, spaces.Box) and isinstance(stored[name], spaces.Box):
             fits = shape == learner and np.dtype(stored[name].dtype).kind == np.dtype(part.dtype).kind
         else:
-            fits = stored[name] == part  # the same numbers, not only as many columns
+            fits = stored[name] == part  # the same values, not only as many columns
         if not fits:
             problem = f"is {stored[name]}, but the learner has {part}"
             raise DatasetError(

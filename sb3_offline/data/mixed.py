@@ -1,4 +1,4 @@
-"""Replay buffers in which the steps of a dataset are mixed with those of an environment."""
+"""Replay buffers that mix the steps of a dataset with those of an environment."""
 
 from typing import Any
 
@@ -55,17 +55,18 @@ class _Mixed:
 
 class MixedReplayBuffer(_Mixed, ReplayBuffer):
     """
-    A ``ReplayBuffer`` whose batches hold transitions of a dataset, in a stated ratio, beside those that were added to it::
+    A ``ReplayBuffer`` whose batches mix transitions of a dataset, in a given ratio, with those that were added to it::
 
         SAC("MlpPolicy", env, replay_buffer_class=MixedReplayBuffer,
             replay_buffer_kwargs={"dataset": "data.h5", "data_ratio": 0.5})
 
     :param args: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
-    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these; with rewards, unless others are given
+    :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these. It needs rewards unless ``rewards`` is
+        given
     :param data_ratio: share of each batch that comes from the dataset
-    :param rewards: (steps,) float32, in place of the dataset's
-    :param checksum: of the data that ``rewards`` are of (:meth:`OfflineReplayBuffer.checksum
-        <sb3_offline.data.buffer.OfflineReplayBuffer.checksum>`); with other data ``DatasetError`` is raised
+    :param rewards: (steps,) float32, rewards that replace the dataset's
+    :param checksum: checksum of the data that ``rewards`` belong to (:meth:`OfflineReplayBuffer.checksum
+        <sb3_offline.data.buffer.OfflineReplayBuffer.checksum>`); other data raise ``DatasetError``
     :param kwargs: see :class:`stable_baselines3.common.buffers.ReplayBuffer`
     """
 

@@ -1,4 +1,4 @@
-"""Distances of observations to goals."""
+"""Distances between observations and goals."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,12 +13,12 @@ from sb3_offline.common.torch_layers import StandardizedExtractor
 
 class ObservationVectors:
     """
-    Observations as vectors: pixels in [0, 1], numbers with the mean 0 and the standard deviation 1 that they have in the
-    dataset, choices one-hot. Entries of dicts stand side by side.
+    Observations as vectors. Images are scaled to [0, 1], vectors are standardised by the dataset's mean and standard
+    deviation, and discrete observations are one-hot. The entries of a dict are concatenated.
 
     :param space: Observation space, images channel-first
-    :param statistics: gives (mean, variance, count) of the dataset's observations, or a dict of such for the named keys of
-        dict observations; ``None`` where observations are normalised already
+    :param statistics: function that returns (mean, variance, count) of the dataset's observations, or a dict of these for the
+        given keys of dict observations; ``None`` if observations are normalised already
     """
 
     def __init__(self, space: spaces.Space, statistics: Callable[[list[str] | None], Any] | None):

@@ -1,4 +1,4 @@
-"""Judging what was learned without an environment: callbacks and functions over held-out data."""
+"""Evaluation without an environment, on held-out data: callbacks and functions."""
 
 from sb3_offline.evaluation.callbacks import OfflineEvalCallback
 from sb3_offline.evaluation.fitted_q import fitted_q_evaluation

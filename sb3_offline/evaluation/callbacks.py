@@ -1,4 +1,4 @@
-"""A callback that judges a learner by held-out data."""
+"""A callback that evaluates a model on held-out data."""
 
 import numpy as np
 import torch as th
@@ -19,25 +19,27 @@ from sb3_offline.evaluation.metrics import judge_probabilities, success_to_come
 
 class OfflineEvalCallback(BaseCallback):
     """
-    Judges a model without an environment, and logs under ``offline_eval/`` what applies to it:
+    Evaluates a model without an environment. It logs the measures that apply to the model under ``offline_eval/``:
 
-    - ``td_error``: mean absolute error of the Bellman equation of the learned policy (for CEBORL and RCE, of the recursion of
-      their probabilities). Small on the training data and large on held-out data: overfitting. Growing: divergence.
-    - ``initial_value``, ``initial_value_std``: what the critic makes of the episodes' first states (for CEBORL and RCE the
-      logit of C). Far above ``data_return``, the mean discounted return of the episodes: overestimation.
-    - ``examples_accuracy``, ``_auc``, ``_calibration_error``: how a classifier of success tells held-out examples from
-      held-out data, both counting the same
-    - ``success_accuracy``, ``_auc``, ``_calibration_error``: how it tells states of which success comes from others, where the
-      dataset has success labels
+    - ``td_error``: mean absolute error of the learned policy's Bellman equation (for CEBORL and RCE, of the recursion of their
+      probabilities). An error that is small on the training data and large on held-out data indicates overfitting; a growing
+      error indicates divergence.
+    - ``initial_value``, ``initial_value_std``: mean and standard deviation of the critic's values of the episodes' first
+      states (for CEBORL and RCE, of the logits of C). A mean far above ``data_return``, the mean discounted return of the
+      episodes, indicates overestimation.
+    - ``examples_accuracy``, ``_auc``, ``_calibration_error``: how well a classifier of success tells held-out examples from
+      held-out data, with equal weight for both
+    - ``success_accuracy``, ``_auc``, ``_calibration_error``: how well it tells states from which the episode goes on to
+      succeed from all others, if the dataset has success labels
     - ``fqe_value``: the policy's discounted return by :func:`~sb3_offline.evaluation.fitted_q.fitted_q_evaluation`
 
-    A run with it is the same as one without.
+    A run with this callback equals a run without it.
 
-    :param dataset: held-out data, of the same spaces; default: what the model learns from
+    :param dataset: held-out data with the same spaces; default: the data that the model learns from
     :param examples: held-out success examples, for learners from examples
     :param eval_freq: gradient steps between two evaluations
-    :param n_transitions: transitions that are looked at, the same ones each time
-    :param fqe_steps: gradient steps of each fitted Q evaluation (0: none), which need rewards
+    :param n_transitions: number of transitions to evaluate on, the same ones each time
+    :param fqe_steps: gradient steps of each fitted Q evaluation (0: none), which needs rewards
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     """
 
@@ -85,7 +87,7 @@ class OfflineEvalCallback(BaseCallback):
 
     def evaluate(self) -> dict[str, float]:
         """
-        :return: what is logged
+        :return: the measures by name, without the prefix
         """
         model = self.model
         model.policy.set_training_mode(False)  # train() sets it again
@@ -132,10 +134,10 @@ def _numpy(tensor: th.Tensor | None) -> np.ndarray:
 
 def discounted_returns(buffer: OfflineReplayBuffer, gamma: float, env: VecNormalize | None = None) -> np.ndarray:
     """
-    :param buffer: with rewards
+    :param buffer: a buffer with rewards
     :param gamma: the discount factor
     :param env: normalises rewards
-    :return: (E,) the discounted returns of its episodes
+    :return: (E,) the discounted return of each episode
     """
     starts = first_steps(buffer)
     lengths = np.diff(np.append(starts, buffer.size()))

@@ -1,4 +1,4 @@
-"""Fitted Q evaluation: the value of a policy, from data alone."""
+"""Fitted Q evaluation: the value of a policy, estimated from data alone."""
 
 from itertools import chain
 from typing import Any
@@ -28,22 +28,22 @@ def fitted_q_evaluation(
     seed: int = 0,
 ) -> np.ndarray:
     """
-    Fitted Q evaluation (https://arxiv.org/abs/1911.06854): a critic of its own is fitted to the policy's values,
-    ``Q(s, a) = r + gamma (1 - terminated) Q(s', pi(s'))``, and asked for the episodes' first states. Neither the model nor
-    any random generator changes.
+    Fitted Q evaluation (https://arxiv.org/abs/1911.06854): fits a new critic to the policy's values, ``Q(s, a) = r + gamma (1
+    - terminated) Q(s', pi(s'))``, and evaluates it in the episodes' first states. Neither the model nor any random generator
+    changes.
 
-    As every estimate from data alone, it knows nothing of actions that the data do not hold; it is least wrong for policies
-    near them.
+    Like every estimate from data alone, it has no information about actions outside the data. It is most accurate for
+    policies near the data.
 
-    :param model: any algorithm of this library; its ``gamma`` counts
-    :param buffer: data to fit to, with rewards; default: the model's own, relabelled where it relabels
+    :param model: a model of this library, whose ``gamma`` is used
+    :param buffer: data with rewards to fit to; default: the model's own, with the rewards that it learns from
     :param n_steps: gradient steps
     :param batch_size: transitions in a batch
-    :param learning_rate: of Adam
+    :param learning_rate: learning rate of Adam
     :param tau: the soft update coefficient of the target
-    :param deterministic: evaluate the policy's mode; otherwise the policy as it samples
-    :param seed: of weights, batches and sampled actions
-    :return: (E,) the values of the episodes' first states; their mean estimates the policy's discounted return
+    :param deterministic: whether to evaluate the policy's mode instead of its samples
+    :param seed: seed of weights, batches and sampled actions
+    :return: (E,) values of the episodes' first states. Their mean estimates the policy's discounted return
     """
     model._data.check_normalizer(model._vec_normalize_env)  # or the policy would see other observations than it learned from
     buffer = (model.replay_buffer if buffer is None else buffer).single_steps()
@@ -84,21 +84,25 @@ def new_critic(policy: OfflinePolicy) -> OfflineCritic:
 
 
 def first_steps(buffer: OfflineReplayBuffer) -> np.ndarray:
-    """:return: (E,) numbers of the episodes' first steps"""
+    """:return: (E,) indices of the episodes' first steps"""
     lengths = np.fromiter(chain.from_iterable(dataset.lengths for dataset in buffer.datasets), dtype=np.int64)
     return np.cumsum(lengths) - lengths
 
 
 @th.no_grad()
 def state_values(
-    critic: OfflineCritic, model: OfflineAlgorithm, buffer: OfflineReplayBuffer, steps: np.ndarray, deterministic: bool = True
+    critic: OfflineCritic,
+    model: OfflineAlgorithm,
+    buffer: OfflineReplayBuffer,
+    indices: np.ndarray,
+    deterministic: bool = True,
 ) -> np.ndarray:
     """
-    :param critic: whose values; of several the lowest
-    :param model: whose policy chooses the actions
-    :param buffer: where the states are
-    :param steps: (n,) their steps
-    :param deterministic: take the policy's mode
+    :param critic: critic, of whose networks the lowest counts
+    :param model: model whose policy chooses the actions
+    :param buffer: buffer that holds the states
+    :param indices: (n,) indices of their steps
+    :param deterministic: whether to take the policy's mode
     :return: (n,) ``Q(s, pi(s))``
     """
 
@@ -106,10 +110,10 @@ def state_values(
         actions = model.policy._predict(observations, deterministic=deterministic)
         return critic.values(critic.encode(observations), actions).amin(dim=0)
 
-    batches = batches_of(buffer, steps, model._vec_normalize_env)
+    batches = batches_of(buffer, indices, model._vec_normalize_env)
     return np.concatenate([value(batch.observations).float().cpu().numpy() for batch in batches])
 
 
-def batches_of(buffer: OfflineReplayBuffer, steps: np.ndarray, env: VecNormalize | None) -> Any:
-    """:return: iterator over the transitions of these steps, a few hundred at a time"""
-    return (buffer.transitions(steps[first : first + CHUNK], env) for first in range(0, len(steps), CHUNK))
+def batches_of(buffer: OfflineReplayBuffer, indices: np.ndarray, env: VecNormalize | None) -> Any:
+    """:return: iterator over the transitions with these indices, a few hundred at a time"""
+    return (buffer.transitions(indices[first : first + CHUNK], env) for first in range(0, len(indices), CHUNK))

@@ -1,4 +1,4 @@
-"""How well probabilities tell two classes apart, and whether they mean what they say."""
+"""How well probabilities separate two classes, and how well they are calibrated."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ N_BINS = 10
 def judge_probabilities(probabilities: np.ndarray, labels: np.ndarray) -> dict[str, float]:
     """
     :param probabilities: (n,) in [0, 1]
-    :param labels: (n,) bool, with both classes in them; the rarer one counts as much as the other
+    :param labels: (n,) bool, of both classes; both have the same weight
     :return: ``accuracy`` (balanced, at 0.5), ``auc`` (0.5: chance), ``calibration_error`` (mean distance between the
-        probability and the frequency of what it predicts, over ten bins of equal width)
+        probability and the observed frequency, over ten bins of equal width)
     """
     weights = np.where(labels, 0.5 / labels.sum(), 0.5 / (~labels).sum())
     accuracy = (weights * ((probabilities > 0.5) == labels)).sum()
@@ -22,8 +22,8 @@ def judge_probabilities(probabilities: np.ndarray, labels: np.ndarray) -> dict[s
 def auc(scores: np.ndarray, labels: np.ndarray) -> float:
     """
     :param scores: (n,)
-    :param labels: (n,) bool, with both classes in them
-    :return: probability that a positive scores above a negative; ties count half
+    :param labels: (n,) bool, of both classes
+    :return: the probability that a positive scores above a negative; ties count half
     """
     _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
@@ -33,7 +33,7 @@ def auc(scores: np.ndarray, labels: np.ndarray) -> float:
 
 def success_to_come(success: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """
-    :param success: (N,) bool, of the steps of episodes one after another
+    :param success: (N,) bool, success after each step, of all episodes one after the other
     :param lengths: (E,) steps of each episode
     :return: (N,) bool, whether the episode succeeds at this step or at a later one
     """

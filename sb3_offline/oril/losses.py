@@ -1,4 +1,4 @@
-"""The losses of ORIL's reward classifier as a plain function of logits."""
+"""The loss of ORIL's reward model as a plain function of logits."""
 
 import torch as th
 from torch.nn import functional as F
@@ -8,11 +8,11 @@ def classifier_loss(example_logits: th.Tensor, data_logits: th.Tensor, positive_
     """
     Cross-entropy of examples (label 1) and observations of the dataset (label 0).
 
-    The dataset is not all failures. With ``positive_prior`` eta it counts as a mixture, of which a share eta is like the
-    examples: ``eta CE(f_E; 1) + CE(f_U; 0) - eta CE(f_E; 0)``.
+    The dataset also contains successes. With ``positive_prior`` eta it is treated as a mixture in which a share eta looks like
+    the examples: ``eta CE(f_E; 1) + CE(f_U; 0) - eta CE(f_E; 0)``.
 
-    :param example_logits: of success examples, f_E, ``(n_examples,)``
-    :param data_logits: of dataset observations, f_U, ``(batch,)``
+    :param example_logits: logits of success examples, f_E, ``(n_examples,)``
+    :param data_logits: logits of the dataset's observations, f_U, ``(batch,)``
     :param positive_prior: eta; ``None`` for the plain cross-entropy
     :return: scalar
     """

@@ -1,4 +1,4 @@
-"""The classifier whose probability of success is ORIL's reward."""
+"""ORIL's reward model: a classifier whose probability of success is the reward."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch import nn
 
 class RewardClassifier(BaseModel):
     """
-    Tells success examples from observations of the dataset, by an encoder of its own. It sees no action.
+    A classifier that tells success examples from the dataset's observations. It has its own encoder and sees no action.
 
     :param observation_space: Observation space
     :param action_space: Action space
