@@ -1,4 +1,4 @@
-"""``sb3-offline benchmark``"""
+"""The command ``sb3-offline benchmark``."""
 
 import argparse
 import functools

@@ -1,4 +1,4 @@
-"""``sb3-offline collect``"""
+"""The command ``sb3-offline collect``."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""``sb3-offline collect-sac``"""
+"""The command ``sb3-offline collect-sac``."""
 
 import argparse
 import sys

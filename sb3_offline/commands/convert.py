@@ -1,4 +1,4 @@
-"""``sb3-offline convert``"""
+"""The command ``sb3-offline convert``."""
 
 import argparse
 from typing import Any

@@ -1,4 +1,4 @@
-"""``sb3-offline demo``"""
+"""The command ``sb3-offline demo``."""
 
 import argparse
 from pathlib import Path

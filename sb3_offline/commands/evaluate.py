@@ -1,4 +1,4 @@
-"""``sb3-offline evaluate``"""
+"""The command ``sb3-offline evaluate``."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""``sb3-offline examples``"""
+"""The command ``sb3-offline examples``."""
 
 import argparse
 import os

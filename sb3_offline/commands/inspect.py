@@ -1,4 +1,4 @@
-"""``sb3-offline inspect``"""
+"""The command ``sb3-offline inspect``."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""``sb3-offline render``"""
+"""The command ``sb3-offline render``."""
 
 import argparse
 

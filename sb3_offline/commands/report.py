@@ -1,4 +1,4 @@
-"""``sb3-offline report``"""
+"""The command ``sb3-offline report``."""
 
 import argparse
 from pathlib import Path

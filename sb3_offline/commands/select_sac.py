@@ -1,4 +1,4 @@
-"""``sb3-offline select-sac``"""
+"""The command ``sb3-offline select-sac``."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``sb3-offline train``"""
+"""The command ``sb3-offline train``."""
 
 import argparse
 from pathlib import Path

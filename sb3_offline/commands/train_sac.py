@@ -1,4 +1,4 @@
-"""``sb3-offline train-sac``"""
+"""The command ``sb3-offline train-sac``."""
 
 import argparse
 from pathlib import Path
