@@ -65,6 +65,19 @@ def test_the_callers_tensors_stay_as_they_are(dtype):
     before = [tensor.detach().clone() for tensor in (x, output, gradient)]
     output.backward(gradient)
     assert all(th.equal(tensor, old) for tensor, old in zip((x, output, gradient), before, strict=True))
+    output = mlp(layers, x)
+    output.detach().zero_()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        output.backward(gradient)
+
+
+@pytest.mark.parametrize("last", [nn.LeakyReLU(inplace=True), nn.Hardtanh(inplace=True)])
+def test_layers_between_may_work_in_place(last):
+    layers, x = nn.Sequential(nn.Linear(5, 8), nn.ReLU(), nn.Linear(8, 8), last), th.randn(6, 5)
+    plain = copy.deepcopy(layers)
+    mlp(layers, x).pow(2).sum().backward()
+    plain(x).pow(2).sum().backward()
+    assert distance(gradients(layers), gradients(plain)) < TOLERANCE[th.float32]
 
 
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])

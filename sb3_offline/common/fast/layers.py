@@ -67,7 +67,7 @@ def _run(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | N
         return _run_plainly(x, relus, parameters, exact)
     if th.is_grad_enabled():
         return _Layers.apply(x, relus, exact, *parameters)  # type: ignore[no-untyped-call]
-    return _forward(x, relus, parameters, exact)[1][-1]
+    return _forward(x, relus, parameters, exact)[0]
 
 
 def _run_plainly(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None], exact: bool) -> th.Tensor:
@@ -89,23 +89,30 @@ def _run_plainly(x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Te
 
 def _forward(
     x: th.Tensor, relus: Sequence[bool], parameters: Sequence[th.Tensor | None], exact: bool
-) -> tuple[list[th.Tensor], list[th.Tensor]]:
-    """:return: the weights in the dtype of ``x``; and ``x``, followed by the outputs of all layers"""
-    # Outputs lie in memory with their features first, (out_features, rows). So all three products, forward and backward, find
-    # the long axis of both sides contiguous: transposing thousands of rows takes as long as multiplying them.
-    weights, inputs = [], [x]
-    for relu, weight, bias in zip(relus, parameters[::2], parameters[1::2], strict=True):
+) -> tuple[th.Tensor, list[th.Tensor], list[th.Tensor]]:
+    """:return: the result; the weights in the dtypes of the products; the output of each layer, ``(out_features, rows)``"""
+    # Outputs lie in memory with their features first. So all three products, forward and backward, find the long axis of both
+    # sides contiguous: transposing thousands of rows takes as long as multiplying them.
+    dtype = x.dtype
+    weights, outputs = [], []
+    for layer, relu in enumerate(relus):
+        weight, bias = parameters[2 * layer : 2 * layer + 2]
         assert weight is not None
+        if exact and layer == len(relus) - 1:
+            dtype = weight.dtype
         # A weight may be some columns of a wider matrix, but oneDNN is a thousand times slower where rows have gaps.
-        weights.append(weight.to(x.dtype).contiguous())
-        if exact and len(weights) == len(relus):
-            output = product(weight, inputs[-1].to(weight.dtype)).t()
-        else:
-            output = product(weights[-1], inputs[-1]).t()
+        weights.append(_in_dtype(weight, dtype).contiguous())
+        output = product(weights[-1], _in_dtype(x, dtype))
+        x = output.t()
         if bias is not None:
-            output.view(-1, *bias.shape).add_(bias.to(output.dtype))
-        inputs.append(relu_(output) if relu else output)
-    return weights, inputs
+            (x if bias.dim() == 1 else x.view(-1, *bias.shape)).add_(_in_dtype(bias, dtype))
+        outputs.append(relu_(output) if relu else output)
+    return x, weights, outputs
+
+
+def _in_dtype(tensor: th.Tensor, dtype: th.dtype) -> th.Tensor:
+    """:return: ``tensor.to(dtype)``, but PyTorch takes longer to find that there is nothing to do"""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 
 class _Layers(th.autograd.Function):
@@ -113,43 +120,57 @@ class _Layers(th.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: th.Tensor, relus: Sequence[bool], exact: bool, *parameters: th.Tensor | None) -> th.Tensor:
-        weights, inputs = _forward(x, relus, parameters, exact)
+        result, weights, outputs = _forward(x, relus, parameters, exact)
+        result = result.data  # PyTorch forbids operations in place on a view that a function returns.
         ctx.relus, ctx.exact = relus, exact
-        ctx.save_for_backward(*parameters, *weights, *(inputs if relus[-1] else inputs[:-1]))
-        return inputs[-1]
+        # A last ReLU's output is saved as the result, so that PyTorch notices if the caller changes it.
+        ctx.save_for_backward(x, *parameters, *weights, *outputs[:-1], result if relus[-1] else None)
+        return result
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
         n_layers = len(ctx.relus)
-        saved = ctx.saved_tensors
-        parameters, weights, inputs = saved[: 2 * n_layers], saved[2 * n_layers : 3 * n_layers], saved[3 * n_layers :]
+        x, *saved = ctx.saved_tensors
+        parameters, weights, outputs = saved[: 2 * n_layers], saved[2 * n_layers : 3 * n_layers], saved[3 * n_layers :]
+        needed = ctx.needs_input_grad
         if th.is_grad_enabled():  # The gradient itself is to be differentiated.
-            return _differentiable_gradients(ctx, gradient, inputs[0], parameters)
-        gradients: list[th.Tensor | None] = [None] * len(ctx.needs_input_grad)
+            return _differentiable_gradients(ctx, gradient, x, parameters)
+        gradients: list[th.Tensor | None] = [None] * len(needed)
+        # From here on gradients are (out_features, rows). They have no offset, so the three digits of bfloat16 are enough.
+        by_feature = _in_dtype(gradient, x.dtype).t().contiguous()
         if ctx.relus[-1]:
-            gradient = gradient.clone()  # It is overwritten, and belongs to the caller.
-        gradient = gradient.to(weights[-1].dtype)  # It has no offset, so the three digits of bfloat16 are enough.
+            outputs[-1] = outputs[-1].t()
+            by_feature = by_feature.clone()  # The ReLU's gradient is written over it, and it may be the caller's.
         for layer in reversed(range(n_layers)):
-            if ctx.relus[layer]:
-                relu_gradient_(gradient, inputs[layer + 1])
-            by_feature = gradient.t().contiguous()
-            of_weight, of_bias = 3 + 2 * layer, 4 + 2 * layer
             weight, bias = parameters[2 * layer : 2 * layer + 2]
-            if ctx.needs_input_grad[of_bias]:
-                rows = bias.shape[0] if bias.dim() == 2 else 1
-                sums = by_feature.view(len(by_feature), -1, rows).sum(dim=1)
-                gradients[of_bias] = sums.t().reshape(bias.shape).to(bias.dtype)
-            if ctx.needs_input_grad[of_weight]:
-                x = inputs[layer].t()
+            of_weight, of_bias = 3 + 2 * layer, 4 + 2 * layer
+            if ctx.relus[layer]:
+                relu_gradient_(by_feature, outputs[layer])
+            if needed[of_bias]:
+                gradients[of_bias] = _in_dtype(_bias_gradient(by_feature, bias.shape), bias.dtype)
+            if needed[of_weight]:
+                inputs = outputs[layer - 1] if layer else x.t()
                 # oneDNN is faster with the larger number of features on its right.
-                of_weights = product(x, by_feature).t() if len(x) < len(by_feature) else product(by_feature, x)
-                gradients[of_weight] = of_weights.to(weight.dtype)
-            if not any(ctx.needs_input_grad[:of_weight]):
+                swap = inputs.shape[0] < by_feature.shape[0]
+                of_weights = product(inputs, by_feature).t() if swap else product(by_feature, inputs)
+                gradients[of_weight] = _in_dtype(of_weights, weight.dtype)
+            if not any(needed[:of_weight]):
                 break
-            gradient = product(weights[layer].t(), by_feature.t()).t()
+            by_feature = product(_in_dtype(weights[layer], x.dtype).t(), by_feature.t())
         else:
-            gradients[0] = gradient
+            gradients[0] = by_feature.t()
         return tuple(gradients)
+
+
+def _bias_gradient(by_feature: th.Tensor, shape: Sequence[int]) -> th.Tensor:
+    """
+    :param by_feature: gradient of a layer's output, ``(out_features, rows)``
+    :param shape: shape of the bias, see :data:`WeightAndBias`
+    :return: gradient of the bias, of its shape
+    """
+    if len(shape) == 1:
+        return by_feature.sum(dim=1)
+    return by_feature.view(by_feature.shape[0], -1, shape[0]).sum(dim=1).t().reshape(shape)
 
 
 def _differentiable_gradients(

@@ -44,9 +44,9 @@ def product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
     :param right: ``(m, k)``
     :return: ``left @ right.T``, ``(n, m)``, contiguous in new memory, without a gradient
     """
-    if _linear_pointwise is not None and left.device.type == "cpu" and left.dtype == th.float32 and right.numel() > 0:
+    if _linear_pointwise is not None and left.dtype == th.float32 and left.device.type == "cpu" and right.numel() > 0:
         return _linear_pointwise(left, right, None, "none", [], "")  # type: ignore[no-any-return]
-    return left @ right.t()
+    return th.mm(left, right.t())
 
 
 def relu_(x: th.Tensor) -> th.Tensor:
