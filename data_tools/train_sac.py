@@ -29,9 +29,8 @@ from sb3_offline.data.files import replacing
 from sb3_offline.data_tools.sac_policies import SacActor, actor_weights
 from sb3_offline.data_tools.workers import map_in_order
 from sb3_offline.envs import ENV_ID
-from sb3_offline.envs.multimodal_metaworld import TASKS
-from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH, STATE_NAMES
-from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
+from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, TASKS
+from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH
 
 SOLVED = 0.9
 """Training stops when this share of evaluation episodes has been reached twice in a row."""
@@ -197,7 +196,7 @@ def _state_scaling(env: gym.Env) -> tuple[np.ndarray, np.ndarray]:
     :return: (21,) the state at the start with everything at its nominal place; (21,) a decimetre, or half a radian
     """
     table: Any = env.unwrapped
-    table.scene.reset(np.zeros((len(BODY_POSITIONS), 2)))
+    table.scene.reset()
     scale = [0.5 if name.endswith(("angle", "opening")) else 0.1 for name in STATE_NAMES]
     return table.get_state().astype(np.float64), np.array(scale)
 
