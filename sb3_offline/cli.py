@@ -82,25 +82,27 @@ def _tool(name: str) -> Callable[[argparse.ArgumentParser], Callable]:
 def _collect(parser: argparse.ArgumentParser) -> Callable:
     parser.add_argument("output", help="HDF5 file to write")
     parser.add_argument("--episodes-per-task", type=int, default=300)
-    parser.add_argument("--tasks", nargs="+", help="default: all five")
+    parser.add_argument("--table", default="paper", help='of the environment: "paper" (default) or "second"')
+    parser.add_argument("--tasks", nargs="+", help="default: all of the table")
     parser.add_argument("--obs-type", choices=("state", "pixels"), default="state")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2, help="processes; the file is the same for any number")
     parser.add_argument("--overwrite", action="store_true")
 
     def run(args: argparse.Namespace) -> None:
-        from sb3_offline.data_tools.collect_scripted import TASKS, collect_scripted
+        from sb3_offline.data_tools.collect_scripted import collect_scripted
 
         if Path(args.output).exists() and not args.overwrite:
             sys.exit(f"sb3-offline: {args.output} exists already; name another file, or add --overwrite")
         shares = collect_scripted(
             args.output,
             episodes_per_task=args.episodes_per_task,
-            tasks=args.tasks or TASKS,
+            tasks=args.tasks,
             obs_type=args.obs_type,
             seed=args.seed,
             n_workers=args.workers,
             mode="w" if args.overwrite else "x",
+            table=args.table,
         )
         for task, share in shares.items():
             print(f"{task:<12} {share:6.1%} of the episodes solved")
