@@ -42,21 +42,23 @@ class Script(NamedTuple):
     """Range of the action noise with which most straight attempts succeed."""
     straight: float
     """Share of attempts that go straight, chosen so that a third of all attempts succeed."""
-    release: tuple[float, float, float] | None = None
-    """Hand action after success, where the stock policy would undo its success by going on."""
+    lets_go: bool = False
+    """Whether the stock policy undoes its success, so that the hand has to stop there."""
+    retreat: float | None = None
+    """Height (m) to which a stopped hand withdraws, where it would go on pressing otherwise."""
 
 
 SCRIPTS = {
     "dial-turn": Script(policies.SawyerDialTurnV3Policy, 1.0, 16, (0.03, 0.2), 0.37),
     "door-open": Script(policies.SawyerDoorOpenV3Policy, 1.0, 20, (0.03, 0.3), 0.28),
     "drawer-open": Script(policies.SawyerDrawerOpenV3Policy, 1.0, 20, (0.03, 0.3), 0.29),
-    "lever-pull": Script(policies.SawyerLeverPullV3Policy, 0.5, 36, (0.03, 0.15), 0.34, release=(0.0, 0.0, 0.0)),
+    "lever-pull": Script(policies.SawyerLeverPullV3Policy, 0.5, 36, (0.03, 0.15), 0.34, lets_go=True),
     "plate-slide": Script(policies.SawyerPlateSlideV3Policy, 1.0, 23, (0.03, 0.3), 0.31),
-    "button-press": Script(policies.SawyerButtonPressV3Policy, 1.0, 20, (0.03, 0.3), 0.28),
-    "coffee-button": Script(policies.SawyerCoffeeButtonV3Policy, 1.0, 19, (0.03, 0.3), 0.15, release=(0.0, 0.0, 0.0)),
-    "faucet-open": Script(policies.SawyerFaucetOpenV3Policy, 1.0, 17, (0.03, 0.3), 0.25),
-    "handle-press": Script(policies.SawyerHandlePressV3Policy, 1.0, 25, (0.03, 0.3), 0.25, release=(0.0, 0.0, 0.5)),
-    "window-open": Script(policies.SawyerWindowOpenV3Policy, 1.0, 23, (0.03, 0.3), 0.22),
+    "button-press": Script(policies.SawyerButtonPressV3Policy, 1.0, 19, (0.03, 0.3), 0.28),
+    "faucet-close": Script(policies.SawyerFaucetCloseV3Policy, 1.0, 26, (0.03, 0.3), 0.23),
+    "faucet-open": Script(policies.SawyerFaucetOpenV3Policy, 1.0, 22, (0.03, 0.3), 0.2),
+    "handle-press": Script(policies.SawyerHandlePressV3Policy, 1.0, 25, (0.03, 0.3), 0.28, lets_go=True, retreat=0.18),
+    "window-open": Script(policies.SawyerWindowOpenV3Policy, 1.0, 24, (0.03, 0.3), 0.22),
 }
 
 # Shares of the ways in which the other attempts go.
@@ -80,9 +82,7 @@ class _Attempt:
             direction = rng.normal(size=3) * (1.0, 1.0, 0.5)
             self._aim = direction / np.linalg.norm(direction) * rng.uniform(0.09, 0.18)
         self._end = rng.integers(1, int(0.85 * self._script.n_decisions)) if manner == "aborted" else None
-        release = self._script.release
-        # Without a release of its own, a script rests after half of its successes and goes on after the others.
-        self._release = release if release is not None else (0.0, 0.0, 0.0) if rng.random() < 0.5 else None
+        self._rests_after_success = self._script.lets_go or rng.random() < 0.5
         self._afterwards = rng.choice(["rest", "drift", "leave"])
         self._drift = np.append(rng.uniform(-0.6, 0.6, 3), rng.uniform(-1.0, 1.0))
         self._elsewhere = rng.uniform(_WORKSPACE_LOW, _WORKSPACE_HIGH)
@@ -103,8 +103,10 @@ class _Attempt:
             stock_observation[:3] += self._aim
             action = self._policy.get_action(stock_observation)
             action[:3] = np.clip(self._script.gain * action[:3], -1.0, 1.0) * self._speed
-            if solved and self._release is not None:
-                action[:3] = self._release
+            if solved and self._rests_after_success:
+                action[:3] = 0.0
+                if self._script.retreat is not None:
+                    action[2] = np.clip(10.0 * (self._script.retreat - hand[2]), -1.0, 1.0)
         noise = self._noise * self._rng.normal(size=4)
         return np.clip(action + noise, -1.0, 1.0).astype(np.float32)
 

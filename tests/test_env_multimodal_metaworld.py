@@ -99,7 +99,7 @@ JOINTS = {  # the joints that make a task's success
     "lever-pull": ("LeverAxis",),
     "plate-slide": ("goal_slidex", "goal_slidey"),
     "button-press": ("btnbox_joint",),
-    "coffee-button": ("coffee_slide",),
+    "faucet-close": ("faucet_joint",),
     "faucet-open": ("faucet_joint",),
     "handle-press": ("handle_slide",),
     "window-open": ("window_slide",),
@@ -166,7 +166,7 @@ STOCK_FILES = {
     },
     "second": {
         "button-press": "button_press",
-        "coffee-button": "coffee",
+        "faucet-close": "faucet",
         "faucet-open": "faucet",
         "handle-press": "handle_press",
         "window-open": "window_horizontal",
@@ -180,7 +180,7 @@ def test_the_composed_scene_keeps_the_stock_bodies_and_options(table):
     for task, file in STOCK_FILES[table].items():
         stock = mujoco.MjModel.from_xml_path(full_V3_path_for(f"sawyer_xyz/sawyer_{file}.xml"))
         aliases = STOCK_TASKS[task].aliases
-        names = {stock.body(i).name for i in range(1, stock.nbody)} - {"", "obj", "mug"}  # the mug is left out
+        names = {stock.body(i).name for i in range(1, stock.nbody)} - {""}
         assert len(names) > 20
         for name in names:
             body = scene.model.body(aliases.get(name, name))
@@ -216,13 +216,14 @@ def test_the_start_of_a_recorded_scene_is_that_of_its_episode(table):
 def test_any_tasks_share_a_table_that_is_a_dict_of_positions(monkeypatch):
     place = itertools.count(3.0, 3.0)  # far from each other
     positions = {task: {name: (next(place), 0.0, 0.0) for name in stock.objects} for task, stock in STOCK_TASKS.items()}
+    positions["faucet-open"] = {}  # the faucet has been placed for faucet-close
     monkeypatch.setitem(TABLES, "all of them", positions)
     env = make("window-open", table="all of them").unwrapped
     state, info = env.reset(seed=0)
     assert env.tasks == tuple(STOCK_TASKS) and not info["task_success"].any() and len(info["task_success"]) == len(env.tasks)
     named = dict(zip(env.state_names, state, strict=True))
-    entries = [entry for stock in STOCK_TASKS.values() for entry in stock.state]
-    assert env.state_names[4:] == tuple(entries) and len(set(entries)) == len(entries)
+    entries = dict.fromkeys(entry for stock in STOCK_TASKS.values() for entry in stock.state)
+    assert env.state_names[4:] == tuple(entries)
     start = env.scene.initial_state(env.scene.get_state())
     for entry, (kind, name, _) in env.table.state.items():
         if kind == "joint":
@@ -232,6 +233,10 @@ def test_any_tasks_share_a_table_that_is_a_dict_of_positions(monkeypatch):
     changed = dict(zip(env.state_names, env.get_state(), strict=True))
     joints = [changed[entry] for entry, quantity in env.table.state.items() if quantity.kind == "joint"]
     assert len(set(joints)) == len(joints) and min(joints) > 0  # each entry reads a joint of its own
+
+    monkeypatch.setitem(TABLES, "incomplete", {"faucet-close": {}})
+    with pytest.raises(ValueError, match=r"'incomplete' places .*but its tasks need faucetBase"):
+        make(table="incomplete")
 
 
 @pytest.mark.filterwarnings("ignore:Constant")
@@ -310,7 +315,7 @@ def test_missing_opengl_is_explained(monkeypatch):
     ("wrong", "message"),
     [
         ({"task": "open-door"}, "'paper' has no task 'open-door'; choose one of dial-turn, door-open, drawer-open"),
-        ({"task": "door-open", "table": "second"}, "'second' has no task 'door-open'; choose one of button-press, coffee"),
+        ({"task": "door-open", "table": "second"}, "'second' has no task 'door-open'; choose one of button-press, faucet"),
         ({"table": "third"}, "Unknown table 'third'; choose one of paper, second"),
         ({"obs_type": "image"}, "obs_type 'image'"),
         ({"render_mode": "depth_array"}, "render_mode 'depth_array'"),

@@ -20,16 +20,16 @@ TABLES: dict[str, dict[str, dict[str, Position]]] = {
         "plate-slide": {"puck_channel": (0.555, 0.47, 0.015), "puck_goal": (0.555, 0.72, 0.0)},
     },
     "second": {
-        "button-press": {"button_box": (-0.25, 0.85, 0.115)},
-        "coffee-button": {"coffee_machine": (0.58, 0.86, 0.0)},
-        "faucet-open": {"faucet": (0.29, 0.6, 0.0)},
-        "handle-press": {"handle_box": (-0.525, 0.85, 0.0)},
-        "window-open": {"window": (0.17, 0.9, 0.16)},
+        "button-press": {"button_box": (-0.15, 0.85, 0.115)},
+        "faucet-close": {"faucetBase": (0.38, 0.58, 0.0)},
+        "faucet-open": {},
+        "handle-press": {"handle_box": (-0.53, 0.85, 0.0)},
+        "window-open": {"window": (0.29, 0.9, 0.16)},
     },
 }
 """
-Each table's tasks, in the order of every per-task array, and for each task the nominal positions (m) of its objects. Each
-episode moves every object by up to `JITTER`, so the positions must leave room for that.
+Each table's tasks, in the order of every per-task array, and for each task the nominal positions (m) of its objects. An object
+that two tasks share is placed once. Each episode moves every object by up to `JITTER`, so positions must leave room for that.
 """
 
 
@@ -67,17 +67,22 @@ class Table:
 def find_table(name: str) -> Table:
     """
     :param name: key in `TABLES`
-    :return: the table; raises ``ValueError``, which names the tables, where there is none of that name
+    :return: the table; raises ``ValueError`` where there is none of that name, or where it does not place the objects that its
+        tasks need
     """
     if name not in TABLES:
         raise ValueError(f"Unknown table {name!r}; choose one of {', '.join(TABLES)}.")
     tasks = TABLES[name]
     compiled_order = sorted(tasks, key=lambda task: not STOCK_TASKS[task].joints_first)
+    positions = {body: position for bodies in tasks.values() for body, position in bodies.items()}
+    objects = {body: thing for task in compiled_order for body, thing in STOCK_TASKS[task].objects.items()}
+    if positions.keys() != objects.keys():
+        raise ValueError(f"Table {name!r} places {', '.join(positions)}, but its tasks need {', '.join(objects)}.")
     return Table(
         name,
         tasks=tuple(tasks),
-        positions={body: position for bodies in tasks.values() for body, position in bodies.items()},
-        objects={body: thing for task in compiled_order for body, thing in STOCK_TASKS[task].objects.items()},
+        positions=positions,
+        objects=objects,
         state={entry: quantity for task in tasks for entry, quantity in STOCK_TASKS[task].state.items()},
     )
 

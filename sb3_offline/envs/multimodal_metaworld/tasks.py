@@ -8,10 +8,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from metaworld.envs.sawyer_button_press_v3 import SawyerButtonPressEnvV3
-from metaworld.envs.sawyer_coffee_button_v3 import SawyerCoffeeButtonEnvV3
 from metaworld.envs.sawyer_dial_turn_v3 import SawyerDialTurnEnvV3
 from metaworld.envs.sawyer_door_v3 import SawyerDoorEnvV3
 from metaworld.envs.sawyer_drawer_open_v3 import SawyerDrawerOpenEnvV3
+from metaworld.envs.sawyer_faucet_close_v3 import SawyerFaucetCloseEnvV3
 from metaworld.envs.sawyer_faucet_open_v3 import SawyerFaucetOpenEnvV3
 from metaworld.envs.sawyer_handle_press_v3 import SawyerHandlePressEnvV3
 from metaworld.envs.sawyer_lever_pull_v3 import SawyerLeverPullEnvV3
@@ -101,6 +101,15 @@ _OFF_WHITE: Colour = (0.95, 0.95, 0.9, 1.0)
 _BLUE: Colour = (0.1, 0.3, 0.9, 1.0)
 _GREEN: Colour = (0.1, 0.75, 0.2, 1.0)
 
+_FAUCET = TableObject(
+    "faucet.xml",
+    "faucet",
+    sites={"goal_open": (0.175, 0.0, 0.125), "goal_close": (-0.175, 0.0, 0.125)},
+    renamed={Element("joint", "faucet_link2", "knob_Joint_1"): "faucet_joint"},
+    colours={"faucet_red": _BLUE},
+)
+_FAUCET_STATE = {**_coordinates("faucet_tip", "site", "handleStartOpen"), "faucet_angle": Quantity("joint", "faucet_joint")}
+
 STOCK_TASKS: dict[str, StockTask] = {
     "dial-turn": StockTask(
         SawyerDialTurnEnvV3,
@@ -155,41 +164,8 @@ STOCK_TASKS: dict[str, StockTask] = {
         aliases={"box": "button_box"},
         sets_joints=False,
     ),
-    "coffee-button": StockTask(
-        SawyerCoffeeButtonEnvV3,
-        {
-            "coffee_machine": TableObject(
-                "coffeemachine.xml",
-                "coffeemachine",
-                renamed={
-                    Element("joint", "cmbutton", "goal_slidey"): "coffee_slide",
-                    Element("site", "cmbutton", "buttonStart"): "coffee_button_start",
-                },
-            )
-        },
-        {
-            **_coordinates("coffee_button", "site", "coffee_button_start"),
-            "coffee_slide": Quantity("joint", "coffee_slide"),
-        },
-        aliases={"buttonStart": "coffee_button_start"},
-        sets_joints=False,
-    ),
-    "faucet-open": StockTask(
-        SawyerFaucetOpenEnvV3,
-        {
-            "faucet": TableObject(
-                "faucet.xml",
-                "faucet",
-                renamed={Element("joint", "faucet_link2", "knob_Joint_1"): "faucet_joint"},
-                colours={"faucet_red": _BLUE},
-            )
-        },
-        {
-            **_coordinates("faucet_tip", "site", "handleStartOpen"),
-            "faucet_angle": Quantity("joint", "faucet_joint"),
-        },
-        aliases={"faucetBase": "faucet", "goal_open": "goal"},
-    ),
+    "faucet-close": StockTask(SawyerFaucetCloseEnvV3, {"faucetBase": _FAUCET}, _FAUCET_STATE),
+    "faucet-open": StockTask(SawyerFaucetOpenEnvV3, {"faucetBase": _FAUCET}, _FAUCET_STATE),
     "handle-press": StockTask(
         SawyerHandlePressEnvV3,
         {
