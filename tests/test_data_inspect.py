@@ -224,7 +224,9 @@ def test_states_of_the_table_are_drawn_and_mapped(tmp_path):
 
     from sb3_offline.data_tools.collecting.scripted import collect_scripted
     from sb3_offline.envs.multimodal_metaworld import TASKS, scene
+    from sb3_offline.envs.multimodal_metaworld.tables import find_table
 
+    table = find_table("paper")
     path = tmp_path / "states.h5"
     collect_scripted(path, episodes_per_task=1, tasks=("door-open", "lever-pull"), n_workers=1, progress=False)
     page, data, summary = inspect(tmp_path, path), JoinedDatasets(path), inspect_dataset(path)
@@ -236,8 +238,8 @@ def test_states_of_the_table_are_drawn_and_mapped(tmp_path):
     assert tasks["door-open"][1] == "{success:.1%} {return:.4g}".format(**summary["tasks"]["door-open"]["door-open"])
 
     coverage = table_coverage(data)
-    assert coverage.counts["all"].sum() == data.n_steps + 2 and set(coverage.bodies) == set(scene.BODY_POSITIONS)
-    assert np.abs(np.subtract(coverage.bodies["dial"], scene.BODY_POSITIONS["dial"][:2])).max() <= scene.JITTER
+    assert coverage.counts["all"].sum() == data.n_steps + 2 and set(coverage.bodies) == set(table.positions)
+    assert np.abs(np.subtract(coverage.bodies["dial"], table.positions["dial"][:2])).max() <= scene.JITTER
     x, y = np.unravel_index(coverage.counts["door-open"].argmax(), coverage.counts["door-open"].shape)
     hands = data.arrays["observations"][:][:51, :2]
     inside = (np.abs(hands[:, 0] - coverage.edges[0][x] - 0.01) <= 0.01) & (
@@ -246,5 +248,5 @@ def test_states_of_the_table_are_drawn_and_mapped(tmp_path):
     assert inside.sum() == coverage.counts["door-open"].max()
     env, state = gym.make("MultimodalMetaworld-v0").unwrapped, data.arrays["extras/scene_state"][7:8][0]
     env.scene.set_state(state)
-    np.testing.assert_array_equal(env.scene.data.mocap_pos[0], state[scene.SCENE_STATE["hand_target"]])
-    np.testing.assert_array_equal(env.scene.data.qpos, state[scene.SCENE_STATE["joints"]])
+    np.testing.assert_array_equal(env.scene.data.mocap_pos[0], state[table.scene_state["hand_target"]])
+    np.testing.assert_array_equal(env.scene.data.qpos, state[table.scene_state["joints"]])

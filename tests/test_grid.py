@@ -262,7 +262,16 @@ def test_a_wrong_grid_is_refused_before_anything_runs(data, tmp_path, changes, m
 
 
 @pytest.mark.parametrize(
-    "name", ["table1_states", "table1_pixels", "tuning_states", "tuning_pixels", "ceborl_states", "ceborl_pixels"]
+    "name",
+    [
+        "table1_states",
+        "table1_pixels",
+        "tuning_states",
+        "tuning_pixels",
+        "ceborl_states",
+        "ceborl_pixels",
+        "second_table_states",
+    ],
 )
 def test_shipped_grids_can_be_planned(name, tmp_path):
     grid = load_grid(name)

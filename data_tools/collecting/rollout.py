@@ -1,4 +1,4 @@
-"""Attempts at the tasks of the multimodal Meta-World, and their files. Every collecting program uses this module."""
+"""Attempts at the tasks of the multimodal Meta-World, and files of them: what all collecting programs share."""
 
 from __future__ import annotations
 
@@ -13,16 +13,10 @@ import numpy as np
 
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.envs import ENV_ID
-from sb3_offline.envs.multimodal_metaworld import TASKS
-from sb3_offline.envs.multimodal_metaworld.env import STATE_NAMES
+from sb3_offline.envs.multimodal_metaworld.tables import find_table
 
-_EXTRAS: dict[str, tuple[tuple[int, ...], str]] = {
-    "task_success": ((5,), "bool"),
-    "task_reward": ((5,), "float32"),
-    "state": ((len(STATE_NAMES),), "float32"),
-    "scene_state": ((30,), "float64"),
-}
-"""Shape of a row and dtype of each extra array of `TaskEpisode`, by name."""
+_EXTRAS = {"task_success": "bool", "task_reward": "float32", "state": "float32", "scene_state": "float64"}
+"""Arrays of `TaskEpisode` that a file holds as extras, with their dtypes."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +26,18 @@ class TaskEpisode:
 
     :param task: the attempted task
     :param seed: seed of the environment's reset
-    :param observations: (T + 1, ...), as the environment returns them
+    :param tasks: the table's tasks, in the order of `task_success`
+    :param observations: (T + 1, ...) of the environment
     :param actions: (T, 4) float32
-    :param task_success: (T, 5) bool, success of each task after each decision
-    :param task_reward: (T, 5) float32, reward of each task
-    :param state: (T, 21) float32, the state observation after each decision, whatever the environment observes
-    :param scene_state: (T, 30) float64, `TableScene.get_state` after each decision: redraws the scene to the byte
+    :param task_success: (T, n_tasks) bool, after each decision
+    :param task_reward: (T, n_tasks) float32
+    :param state: (T, n) float32, the environment's state observation after each decision, also where it observes images
+    :param scene_state: (T, m) float64, `TableScene.get_state` after each decision, enough to draw it again to the byte
     """
 
     task: str
     seed: int
+    tasks: tuple[str, ...]
     observations: np.ndarray
     actions: np.ndarray
     task_success: np.ndarray
@@ -51,8 +47,8 @@ class TaskEpisode:
 
     @property
     def success(self) -> np.ndarray:
-        """(T,) bool, success of the attempted task."""
-        return self.task_success[:, TASKS.index(self.task)]
+        """:return: (T,) bool, success at the attempted task"""
+        return self.task_success[:, self.tasks.index(self.task)]
 
     @property
     def solved(self) -> bool:
@@ -61,29 +57,33 @@ class TaskEpisode:
 
 
 @functools.lru_cache(maxsize=1)
-def shared_env(obs_type: str) -> gym.Env:
+def shared_env(obs_type: str, table: str = "paper") -> gym.Env:
     """
     Create the one environment that all episodes of a process share. It fits every task, because the tasks share their scene.
 
     :param obs_type: "state" or "pixels"
-    :return: the environment
+    :param table: name of the table
+    :return: one environment for all episodes of a process: the tasks share their scene
     """
-    return gym.make(ENV_ID, obs_type=obs_type)
+    return gym.make(ENV_ID, **_env_kwargs(obs_type, table))
+
+
+def _env_kwargs(obs_type: str, table: str) -> dict[str, Any]:
+    # The default is left out, so that files of the paper's table stay as they are.
+    return {"obs_type": obs_type} | ({} if table == "paper" else {"table": table})
 
 
 def roll_out(env: gym.Env, task: str, seed: int, act: Callable[[int, bool], np.ndarray]) -> TaskEpisode:
     """
-    Play one episode.
-
-    :param env: from `shared_env`; it may reward any task
-    :param task: the attempted task
+    :param env: environment of `shared_env`, whose rewarded task does not matter
+    :param task: the task to attempt
     :param seed: seed of the reset
-    :param act: maps the number of earlier decisions, and whether the task is solved by now, to a (4,) float32 action. It reads
-        what else it needs from the environment.
+    :param act: from the number of decisions before, and whether the task has been solved by now, to a (4,) float32 action; it
+        looks at the environment itself
     :return: the episode
     """
     scene_env: Any = env.unwrapped
-    index = TASKS.index(task)
+    index = scene_env.tasks.index(task)
     observation, _ = env.reset(seed=seed)
     observations = [observation]
     actions: list[np.ndarray] = []
@@ -100,7 +100,7 @@ def roll_out(env: gym.Env, task: str, seed: int, act: Callable[[int, bool], np.n
         states.append(scene_env.get_state())
         scene_states.append(scene_env.scene.get_state())
     steps = (observations, actions, successes, rewards, states, scene_states)
-    return TaskEpisode(task, seed, *map(np.stack, steps))
+    return TaskEpisode(task, seed, scene_env.tasks, *map(np.stack, steps))
 
 
 def episode_writer(
@@ -110,42 +110,45 @@ def episode_writer(
     n_episodes: int,
     provenance: Mapping[str, Any],
     mode: Literal["x", "w", "a"],
+    table: str = "paper",
 ) -> DatasetWriter:
     """
-    Open a dataset file for attempts.
-
-    `success` of a step is success of the attempted task, which is the episode's `source`. The file holds no `rewards`: they
-    would mix the rewards of five tasks. The extras are those of `TaskEpisode`; with `state` among them, files of images
-    hold the states too.
+    A step's `success` is success at the attempted task, which is the episode's `source`. The file holds no `rewards`, since it
+    would mix those of several tasks. Its extras are arrays of `TaskEpisode`; `state` is one of them, also beside images.
 
     :param path: path of the file
     :param obs_type: "state" or "pixels"
     :param tasks: the sources
     :param n_episodes: number of episodes that will be added
-    :param provenance: how the data are made
-    :param mode: see `DatasetWriter`
-    :return: the writer, for `add_episode`
+    :param provenance: provenance of the data
+    :param mode: as in `DatasetWriter`
+    :param table: name of the table
+    :return: a writer for `add_episode`
     """
-    env = shared_env(obs_type)
+    env = shared_env(obs_type, table)
+    scene_env: Any = env.unwrapped
+    n_tasks = len(scene_env.tasks)
+    lengths = {"task_success": n_tasks, "task_reward": n_tasks, "state": len(scene_env.state_names)}
+    lengths["scene_state"] = len(scene_env.scene.get_state())
     return DatasetWriter(
         path,
         env.observation_space,
         env.action_space,
         env_id=ENV_ID,
-        env_kwargs={"obs_type": obs_type},
+        env_kwargs=_env_kwargs(obs_type, table),
         provenance=provenance,
         mode=mode,
         rewards=False,
-        extras=_EXTRAS,
+        extras={name: ((lengths[name],), dtype) for name, dtype in _EXTRAS.items()},
         sources=list(tasks),
-        capacity=(n_episodes, n_episodes * env.unwrapped.episode_length),  # type: ignore[attr-defined]
+        capacity=(n_episodes, n_episodes * scene_env.episode_length),
     )
 
 
 def add_episode(writer: DatasetWriter, episode: TaskEpisode) -> None:
     """
-    :param writer: from `episode_writer`
-    :param episode: an attempt at one of the writer's tasks
+    :param writer: writer of `episode_writer`
+    :param episode: an attempt at one of its tasks
     """
     writer.add_episode(
         episode.observations,
@@ -155,12 +158,3 @@ def add_episode(writer: DatasetWriter, episode: TaskEpisode) -> None:
         seed=episode.seed,
         source=episode.task,
     )
-
-
-def check_tasks(tasks: Sequence[str]) -> None:
-    """
-    :param tasks: names of tasks; raises ``ValueError`` if one is not in `TASKS`
-    """
-    unknown = set(tasks) - set(TASKS)
-    if unknown:
-        raise ValueError(f"Unknown tasks {sorted(unknown)}; choose from {', '.join(TASKS)}.")

@@ -43,7 +43,7 @@ SAC_BEHAVIOUR = (
     "stock SB3 SAC agents, trained for one task each from states, at several points of their training; sampled actions"
 )
 # Recorded in the files. It stays when this module moves, because a file is continued only if its whole record is the same.
-PROGRAM = "sb3_offline.data_tools.collect_sac"
+PROGRAM = "sb3_offline.data_tools.collecting.sac"
 HELD_OUT_STREAM = 1
 _GOLDEN = (5**0.5 - 1) / 2
 

@@ -10,7 +10,7 @@ from sb3_offline.data.examples import Observations
 from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
 from sb3_offline.data.selection import check_source, of_source
 
-PROGRAM = "sb3_offline.data_tools.extract_examples"
+PROGRAM = "sb3_offline.data_tools.converting.extract_examples"
 """Recorded in the files; it stays when this module moves."""
 
 

@@ -114,10 +114,10 @@ def task_names(data: JoinedDatasets) -> list[str]:
     if data.env_id != ENV_ID or not {"extras/task_success", "extras/task_reward"} <= data.arrays.keys():
         return []
     try:
-        from sb3_offline.envs.multimodal_metaworld import TASKS
-    except ModuleNotFoundError:  # the extra metaworld is not installed, and the files do not name their tasks
+        from sb3_offline.envs.multimodal_metaworld.tables import find_table
+    except ModuleNotFoundError:  # the extra is not installed, and files do not name their tasks
         return []
-    return list(TASKS)
+    return list(find_table(data.env_kwargs.get("table", "paper")).tasks)
 
 
 def _tasks(data: JoinedDatasets) -> dict[str, dict[str, dict[str, float]]]:
@@ -200,16 +200,18 @@ def table_coverage(data: JoinedDatasets) -> Coverage | None:
     if data.env_id != ENV_ID or not data.n_episodes:
         return None
     try:
-        from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, scene
+        from sb3_offline.envs.multimodal_metaworld import scene
+        from sb3_offline.envs.multimodal_metaworld.tables import find_table
     except ModuleNotFoundError:
         return None
+    table = find_table(data.env_kwargs.get("table", "paper"))
     states, seen = data.arrays.get("extras/scene_state"), data.arrays.get("observations")
-    if seen is not None and seen.shape[1:] == (len(STATE_NAMES),):
+    if seen is not None and seen.shape[1:] == (len(table.state_names),):
         what, lengths = "hand_x and hand_y of the observations", data.lengths + 1
-        hand = seen[:][:, [STATE_NAMES.index("hand_x"), STATE_NAMES.index("hand_y")]]
+        hand = seen[:][:, [table.state_names.index("hand_x"), table.state_names.index("hand_y")]]
     elif states is not None:
-        what, lengths = "the target of the hand in scene_state", data.lengths
-        hand = states[:][:, scene.SCENE_STATE["hand_target"]]
+        what, lengths = "the hand's target in scene_state", data.lengths
+        hand = states[:][:, table.scene_state["hand_target"]]
     else:
         return None
     x, y = hand[:, :2].astype(np.float64).T
@@ -225,8 +227,8 @@ def table_coverage(data: JoinedDatasets) -> Coverage | None:
     bodies: dict[str, tuple[float, float]] = {}
     if states is not None:
         some = states[np.linspace(0, len(states) - 1, min(len(states), 500)).astype(int)]
-        means = some[:, scene.SCENE_STATE["bodies"]].mean(axis=0).reshape(-1, 2)
-        bodies = {name: (float(a), float(b)) for name, (a, b) in zip(scene.BODY_POSITIONS, means, strict=True)}
+        means = some[:, table.scene_state["bodies"]].mean(axis=0).reshape(-1, 2)
+        bodies = {name: (float(a), float(b)) for name, (a, b) in zip(table.positions, means, strict=True)}
     return Coverage(what, (x_edges, y_edges), counts, bodies)
 
 

@@ -28,9 +28,8 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
 from sb3_offline.data_tools.sac.policies import SacActor, actor_weights
 from sb3_offline.envs import ENV_ID
-from sb3_offline.envs.multimodal_metaworld import TASKS
-from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH, STATE_NAMES
-from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS
+from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, TASKS
+from sb3_offline.envs.multimodal_metaworld.env import EPISODE_LENGTH
 from sb3_offline.parallel.processes import map_in_order
 
 SOLVED = 0.9
@@ -208,7 +207,7 @@ def _state_scaling(env: gym.Env) -> tuple[np.ndarray, np.ndarray]:
     :return: (21,) offset, the initial state with every object at its nominal place; (21,) scale, a decimetre or half a radian
     """
     table: Any = env.unwrapped
-    table.scene.reset(np.zeros((len(BODY_POSITIONS), 2)))
+    table.scene.reset()
     scale = [0.5 if name.endswith(("angle", "opening")) else 0.1 for name in STATE_NAMES]
     return table.get_state().astype(np.float64), np.array(scale)
 

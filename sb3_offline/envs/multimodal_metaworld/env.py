@@ -1,4 +1,4 @@
-"""Multimodal Meta-World: five manipulation tasks on one table, none of them named in the observation."""
+"""Multimodal Meta-World: several manipulation tasks on one table, none of them named in the observation."""
 
 from __future__ import annotations
 
@@ -9,50 +9,47 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline.envs.multimodal_metaworld.rendering import CAMERA, FRAME_SIZE, SceneRenderer
-from sb3_offline.envs.multimodal_metaworld.scene import BODY_POSITIONS, JITTER, TableScene
-from sb3_offline.envs.multimodal_metaworld.tasks import TASKS, make_tasks
+from sb3_offline.envs.multimodal_metaworld.judges import make_judges
+from sb3_offline.envs.multimodal_metaworld.rendering import CAMERAS, FRAME_SIZE, SceneRenderer
+from sb3_offline.envs.multimodal_metaworld.scene import TableScene
+from sb3_offline.envs.multimodal_metaworld.state import StateReader
+from sb3_offline.envs.multimodal_metaworld.tables import find_table
 
-STATE_NAMES = (
-    *("hand_x", "hand_y", "hand_z", "gripper_opening"),
-    *("dial_x", "dial_y", "dial_angle"),
-    *("door_handle_x", "door_handle_y", "door_angle"),
-    *("drawer_x", "drawer_y", "drawer_slide"),
-    *("lever_tip_x", "lever_tip_y", "lever_tip_z", "lever_angle"),
-    *("puck_x", "puck_y", "puck_goal_x", "puck_goal_y"),
-)
-"""What the entries of a state observation are: metres and radians, the gripper's opening in [0, 1]."""
 EPISODE_LENGTH = 50
-"""Decisions in an episode, unless told otherwise."""
-# Wide enough for every reachable value, joint limits being soft.
-_STATE_BOUND = np.array([4.0 if name.endswith("angle") else 2.0 for name in STATE_NAMES], dtype=np.float32)
+"""Decisions in an episode by default."""
+
+DEFAULT_TASK = "door-open"
+"""The default task of a table that has it. Another table's default task is its first."""
 
 
 class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     """
-    Five Meta-World tasks around one arm, as in the CEBORL paper. Every task begins alike, and neither frames nor states tell
-    which one is meant; `task` only chooses the reward and `info["success"]`.
+    Several Meta-World tasks around one arm, as in the CEBORL paper. Every task of a table begins alike, and neither images nor
+    states tell which one is meant; `task` only chooses the reward and `info["success"]`.
 
-    An action (hand displacement in x, y, z and gripper effort) is repeated `action_repeat` times; reward and success are those
-    of the state at the end. An episode never terminates and is truncated after `episode_length` decisions.
+    An action (hand displacement in x, y, z and gripper effort) is repeated `action_repeat` times; the reward is that of the
+    state at the end. An episode never terminates and is truncated after `episode_length` decisions.
 
-    :param task: one of `TASKS`
-    :param obs_type: "pixels" for (frame_size, frame_size, 3) uint8 frames, "state" for the vector `STATE_NAMES` (float32)
+    :param task: one of the table's tasks (default: "door-open" where the table has it, else the first)
+    :param obs_type: "pixels" for (frame_size, frame_size, 3) uint8 images, "state" for the float32 vector `state_names`
     :param render_mode: "rgb_array" or None
     :param episode_length: decisions in an episode
     :param action_repeat: control steps of 12.5 ms in a decision
-    :param width: of the pictures of `render()`, whatever the `frame_size`
-    :param height: of the pictures of `render()`
-    :param frame_size: width and height of the observed frames in pixels
-    :param camera: in place of entries of `CAMERA`: `lookat` (x, y, z) and `distance` in metres, `azimuth` and `elevation` in
-        degrees
+    :param width: width of the images of `render()` in pixels, whatever the `frame_size`
+    :param height: height of the images of `render()` in pixels
+    :param frame_size: width and height of the observed images in pixels
+    :param camera: name of a camera in `CAMERAS`, or entries that replace those of the default one: `lookat` (x, y, z) and
+        `distance` in metres, `azimuth` and `elevation` in degrees
+    :param table: name of a table in `TABLES`
+    :param success: "last" to judge the state at the end of a decision, "any" to count a decision as successful if the task was
+        solved after any of its control steps, as the CEBORL paper does
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
-        task: str = "door-open",
+        task: str | None = None,
         obs_type: str = "pixels",
         render_mode: str | None = None,
         episode_length: int = EPISODE_LENGTH,
@@ -60,18 +57,24 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         width: int = 480,
         height: int = 480,
         frame_size: int = FRAME_SIZE,
-        camera: Mapping[str, Any] | None = None,
+        camera: str | Mapping[str, Any] | None = None,
+        table: str = "paper",
+        success: str = "last",
     ) -> None:
-        if task not in TASKS:
-            raise ValueError(f"Unknown task {task!r}; choose one of {', '.join(TASKS)}.")
+        self.table = find_table(table)
+        self.tasks = self.table.tasks
+        if task is None:
+            task = DEFAULT_TASK if DEFAULT_TASK in self.tasks else self.tasks[0]
+        if task not in self.tasks:
+            raise ValueError(f"Table {table!r} has no task {task!r}; choose one of {', '.join(self.tasks)}.")
         if obs_type not in ("pixels", "state"):
             raise ValueError(f'Unknown obs_type {obs_type!r}; choose "pixels" or "state".')
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'Unknown render_mode {render_mode!r}; choose "rgb_array" or None.')
         if frame_size < 1:
-            raise ValueError(f"frame_size is {frame_size}; give the width of a frame in pixels.")
-        if unknown := set(camera or {}) - set(CAMERA):
-            raise ValueError(f"Unknown entries {sorted(unknown)} of camera; choose from {', '.join(CAMERA)}.")
+            raise ValueError(f"frame_size is {frame_size}; give the width of an image in pixels.")
+        if success not in ("last", "any"):
+            raise ValueError(f'Unknown success {success!r}; choose "last" or "any".')
         self.task = task
         self.obs_type = obs_type
         self.render_mode = render_mode
@@ -79,42 +82,34 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         self.action_repeat = action_repeat
         self.width, self.height = width, height
         self.frame_size = frame_size
-        self.camera = {**CAMERA, **(camera or {})}
-        self.scene = TableScene()
-        self._tasks = make_tasks(self.scene)
-        self._task_index = TASKS.index(task)
+        self.camera = _find_camera(camera)
+        self.success = success
+        self.scene = TableScene(self.table)
+        self.state_names = self.table.state_names
+        self._judges = make_judges(self.scene)
+        self._task_index = self.tasks.index(task)
         self._n_decisions = 0
         self._solved = False
         self._renderer: SceneRenderer | None = None
 
+        self._state = StateReader(self.scene.model, self.scene.data, self.table.state)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space: spaces.Box
         if obs_type == "pixels":
             self.observation_space = spaces.Box(0, 255, (frame_size, frame_size, 3), np.uint8)
         else:
-            self.observation_space = spaces.Box(-_STATE_BOUND, _STATE_BOUND, dtype=np.float32)
-
-        model = self.scene.model
-        self._joints = [model.joint(name).qposadr[0] for name in ("knob_Joint_1", "doorjoint", "drawer_slide", "LeverAxis")]
-        self._hand = model.body("hand").id
-        self._claws = [model.body(name).id for name in ("rightclaw", "leftclaw")]
-        self._dial = model.body("dial").id
-        self._drawer = model.body("drawer_link").id
-        self._puck_goal = model.body("puck_goal").id
-        self._door_handle = model.geom("handle").id
-        self._puck = model.geom("puck").id
-        self._lever_tip = model.site("leverStart").id
+            self.observation_space = spaces.Box(-self._state.bound, self._state.bound, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param seed: of the objects' places; the same seed gives the same start for every task
+        :param seed: seed of the objects' places; the same seed gives the same start for every task
         :param options: not used
-        :return: observation and info, which holds the same success entries as `step`'s
+        :return: observation and info, with the same entries as `step`'s
         """
         super().reset(seed=seed)
-        self.scene.reset(self.np_random.uniform(-JITTER, JITTER, (len(BODY_POSITIONS), 2)))
-        for task in self._tasks:
-            task.reset_model()
+        self.scene.reset(self.scene.draw_offsets(self.np_random))
+        for judge in self._judges:
+            judge.reset_model()
         self._n_decisions = 0
         self._solved = False
         return self._observation(), self._judge(np.zeros(4))[1]
@@ -123,34 +118,47 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :param action: (4,) float, clipped to [-1, 1]
         :return: observation, stock reward of the chosen task, False, truncated, and info:
-            `success` (bool), the chosen task's, now;
-            `is_success` (bool), the same at any decision of this episode so far: SB3 reads it at the end, a lever falls back;
-            `task_success` ((5,) bool) and `task_reward` ((5,) float32), of all tasks, now, in the order of `TASKS`
+            `success` (bool), whether this decision solved the chosen task, as the option `success` counts it;
+            `is_success` (bool), whether any decision of this episode so far did: SB3 reads it at the end of an episode, when a
+            lever may have fallen back;
+            `task_success` ((n_tasks,) bool) and `task_reward` ((n_tasks,) float32), `success` and reward of every task, in the
+            order of `tasks`
         """
         action = np.clip(np.asarray(action, dtype=np.float32), -1.0, 1.0)
-        self.scene.advance(action, self.action_repeat)
+        passed = np.zeros(len(self.tasks), dtype=bool)
+
+        def look() -> None:
+            passed[:] |= [judge.judge(action)[1] for judge in self._judges]
+
+        self.scene.advance(action, self.action_repeat, look if self.success == "any" else None)
         self._n_decisions += 1
-        reward, info = self._judge(action)
+        reward, info = self._judge(action, passed)
         return self._observation(), reward, False, self._n_decisions >= self.episode_length, info
 
     def stock_observation(self, task: str) -> np.ndarray:
         """
-        :param task: one of `TASKS`, not necessarily the chosen one
+        :param task: one of the table's tasks, not necessarily the chosen one
         :return: (39,) float64, what that task's scripted policy of Meta-World reads; it holds the goal
         """
-        return self._tasks[TASKS.index(task)].stock_observation()
+        return self._judges[self.tasks.index(task)].stock_observation()
 
-    def _judge(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
-        verdicts = [task.judge(action) for task in self._tasks]
-        reward, success = verdicts[self._task_index]
+    def _judge(self, action: np.ndarray, passed: np.ndarray | bool = False) -> tuple[float, dict[str, Any]]:
+        """
+        :param action: (4,) float, the one that led here
+        :param passed: (n_tasks,) bool, the tasks that were solved on the way
+        :return: reward of the chosen task, and info
+        """
+        verdicts = [judge.judge(action) for judge in self._judges]
+        task_success = np.array([success for _, success in verdicts]) | passed
+        success = bool(task_success[self._task_index])
         self._solved = self._solved or success
         info = {
             "success": success,
             "is_success": self._solved,
-            "task_success": np.array([verdict[1] for verdict in verdicts]),
-            "task_reward": np.array([verdict[0] for verdict in verdicts], dtype=np.float32),
+            "task_success": task_success,
+            "task_reward": np.array([reward for reward, _ in verdicts], dtype=np.float32),
         }
-        return reward, info
+        return verdicts[self._task_index][0], info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
@@ -160,22 +168,22 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def get_picture(self, width: int, height: int) -> np.ndarray:
         """
-        :param width: in pixels
-        :param height: in pixels
-        :return: (height, width, 3) uint8 of the scene as it is, for people: finer than the observation
+        :param width: width in pixels
+        :param height: height in pixels
+        :return: (height, width, 3) uint8, an image of the scene as it is, for people: finer than the observation
         """
         return self._get_renderer().picture(width, height)
 
     def get_frame(self) -> np.ndarray:
         """
-        :return: (frame_size, frame_size, 3) uint8 of the scene as it is: the observation of obs_type "pixels", also where this
-            environment observes states
+        :return: (frame_size, frame_size, 3) uint8, an image of the scene as it is: the observation of obs_type "pixels", also
+            where this environment observes states
         """
         return self._get_renderer().frame()
 
     def get_render_device(self) -> str:
         """
-        :return: what draws here, as OpenGL names it: frames are the same to the byte on the same device only
+        :return: OpenGL's name of what draws here; images are the same to the byte only where it is the same
         """
         return self._get_renderer().device()
 
@@ -186,7 +194,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             self._renderer = None
 
     def _get_renderer(self) -> SceneRenderer:
-        # Made late: neither state observations nor the import of this module may need OpenGL.
+        # Made late, because neither state observations nor the import of this module may need OpenGL.
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene, self.frame_size, self.camera)
         return self._renderer
@@ -196,28 +204,17 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def get_state(self) -> np.ndarray:
         """
-        :return: (21,) float32 of the scene as it is: the observation of obs_type "state", whatever this one's is
+        :return: (n,) float32 of the scene as it is, its entries named by `state_names`: the observation of obs_type "state",
+            also where this environment observes images
         """
-        data = self.scene.data
-        xpos, geoms = data.xpos, data.geom_xpos
-        dial, door, drawer, lever = data.qpos[self._joints]
-        right, left = xpos[self._claws]
-        state = np.array(
-            [
-                *xpos[self._hand],
-                min(np.linalg.norm(right - left) / 0.1, 1.0),
-                *xpos[self._dial, :2],
-                dial,
-                *geoms[self._door_handle, :2],
-                door,
-                xpos[self._drawer, 0],
-                xpos[self._drawer, 1],
-                drawer,
-                *data.site_xpos[self._lever_tip],
-                lever,
-                *geoms[self._puck, :2],
-                *xpos[self._puck_goal, :2],
-            ],
-            dtype=np.float32,
-        )
-        return np.clip(state, -_STATE_BOUND, _STATE_BOUND)
+        return self._state.read()
+
+
+def _find_camera(camera: str | Mapping[str, Any] | None) -> dict[str, Any]:
+    if isinstance(camera, str):
+        if camera not in CAMERAS:
+            raise ValueError(f"Unknown camera {camera!r}; choose one of {', '.join(CAMERAS)}, or give its entries.")
+        return dict(CAMERAS[camera])
+    if unknown := set(camera or {}) - set(CAMERAS["default"]):
+        raise ValueError(f"Unknown entries {sorted(unknown)} of camera; choose from {', '.join(CAMERAS['default'])}.")
+    return {**CAMERAS["default"], **(camera or {})}

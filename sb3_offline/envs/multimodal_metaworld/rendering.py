@@ -1,4 +1,4 @@
-"""Drawing the shared table without a screen: small frames to learn from, and pictures for people."""
+"""Draws a table without a screen: small images to learn from, and finer ones for people."""
 
 from __future__ import annotations
 
@@ -15,13 +15,20 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_offline.envs.multimodal_metaworld.scene import COARSE_ARM_GROUP, FINE_ARM_GROUP, TableScene
+from sb3_offline.envs.multimodal_metaworld.composition import COARSE_ARM_GROUP, FINE_ARM_GROUP
+from sb3_offline.envs.multimodal_metaworld.scene import TableScene
 
 FRAME_SIZE = 64
-_OVERSAMPLING = 2  # pixels drawn for one kept, in each direction: cheaper in software than multisampling, and as smooth
+_OVERSAMPLING = 2  # pixels drawn for each one kept, per direction: cheaper in software than multisampling, and as smooth
 
-CAMERA: dict[str, Any] = {"lookat": (0.08, 0.68, 0.1), "distance": 1.45, "azimuth": 170.0, "elevation": -50.0}
-"""All five objects and the hand's whole workspace, from where the arm hides least (metres and degrees)."""
+CAMERAS: dict[str, dict[str, Any]] = {
+    "default": {"lookat": (0.08, 0.68, 0.1), "distance": 1.45, "azimuth": 170.0, "elevation": -50.0},
+    "paper": {"lookat": (0.075, 0.75, 0.15), "distance": 1.75, "azimuth": 160.0, "elevation": -45.0},
+}
+"""
+Free cameras (metres and degrees). "default" sees all objects and the hand's whole workspace from the side where the arm hides
+least. "paper" is the camera of the CEBORL paper's authors.
+"""
 
 _HELP = """Rendering without a screen needs OpenGL. Install one of these (Debian and Ubuntu packages):
     apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri
@@ -30,7 +37,7 @@ State observations (obs_type="state") without a render_mode need neither."""
 
 
 def _works(backend: str) -> bool:
-    """Try in another process: PyOpenGL and MuJoCo settle on one backend, and cannot go back."""
+    """Try in another process, since PyOpenGL and MuJoCo settle on one backend and cannot go back."""
     code = f"import mujoco.{backend}; mujoco.{backend}.GLContext(8, 8).make_current()"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
@@ -41,7 +48,7 @@ def _choose_backend() -> str:
         return chosen
     if not sys.platform.startswith("linux"):
         return "glfw"
-    # EGL may use a GPU; OSMesa needs no driver. Only where both are installed is there something to find out.
+    # EGL may use a GPU; OSMesa needs no driver. Only where both are installed does EGL have to be tried.
     if find_library("OSMesa") and not (find_library("EGL") and _works("egl")):
         return "osmesa"
     return "egl"
@@ -49,7 +56,7 @@ def _choose_backend() -> str:
 
 def _make_gl_context(width: int, height: int) -> Any:
     """
-    :return: a current OpenGL context of the backend that MUJOCO_GL names, else of the one that works here
+    :return: a current OpenGL context of the backend that MUJOCO_GL names, or else of the backend that works here
     """
     backend = _choose_backend()
     try:
@@ -58,7 +65,7 @@ def _make_gl_context(width: int, height: int) -> Any:
         return context
     except Exception as error:  # each library has errors of its own, down to AttributeError for a missing file
         failure = f"{type(error).__name__}: {error}"
-    # Outside of `except`: the half-made context is gone by now, with its noise, and the help stands last.
+    # Raised outside of `except`, where the half-made context and its messages are gone, so that the help comes last.
     raise RuntimeError(f"{_HELP}\nTried {backend}: {failure}")
 
 
@@ -72,14 +79,16 @@ def _close_all() -> None:
 
 class SceneRenderer:
     """
-    Draws one scene. Owns an OpenGL context; `close` frees it.
+    Draws one scene. It owns an OpenGL context, which `close` frees.
 
-    :param scene: what to draw
-    :param frame_size: width and height of a frame in pixels
-    :param camera: all entries of `CAMERA`
+    :param scene: the scene to draw
+    :param frame_size: width and height of the small images in pixels
+    :param camera: all entries of one of `CAMERAS`
     """
 
-    def __init__(self, scene: TableScene, frame_size: int = FRAME_SIZE, camera: Mapping[str, Any] = CAMERA) -> None:
+    def __init__(
+        self, scene: TableScene, frame_size: int = FRAME_SIZE, camera: Mapping[str, Any] = CAMERAS["default"]
+    ) -> None:
         self._scene = scene
         self._closed = False
         self._frame_size = frame_size
@@ -93,34 +102,34 @@ class SceneRenderer:
         self._drawn = mujoco.MjvScene(scene.model, maxgeom=200)
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._options = mujoco.MjvOption()
-        # Sites mark goals, and one of them only the last task's.
+        # Sites mark goals, which the images must not show.
         self._options.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         for name, value in camera.items():
             setattr(self._camera, name, value)
         _open_renderers.add(self)
-        # Again with each context: it has to run before MuJoCo's own handler, which takes the display away at exit.
+        # Registered anew with each context, to run before MuJoCo's own handler, which takes the display away at exit.
         atexit.unregister(_close_all)
         atexit.register(_close_all)
 
     def frame(self) -> np.ndarray:
         """
-        :return: (frame_size, frame_size, 3) uint8, what a policy sees
+        :return: (frame_size, frame_size, 3) uint8, the image that a policy observes
         """
         return self._draw(self._frame_size, self._frame_size, fine=False)
 
     def picture(self, width: int, height: int) -> np.ndarray:
         """
-        :param width: in pixels
-        :param height: in pixels
+        :param width: width in pixels
+        :param height: height in pixels
         :return: (height, width, 3) uint8 of the same view, with the arm's fine meshes and shadows
         """
         return self._draw(width, height, fine=True)
 
     def device(self) -> str:
         """
-        :return: the name that OpenGL gives to what draws here
+        :return: OpenGL's name of the device or program that draws here
         """
         from OpenGL import GL  # only now: the backend has been chosen
 
@@ -145,7 +154,7 @@ class SceneRenderer:
         return (blocks.sum(axis=(1, 3), dtype=np.uint16) // _OVERSAMPLING**2).astype(np.uint8)
 
     def close(self) -> None:
-        """Free the OpenGL context; again does nothing."""
+        """Free the OpenGL context. A second call does nothing."""
         if self._closed:
             return
         self._closed = True

@@ -1,99 +1,190 @@
-"""The stock Meta-World task classes, unmodified, judging one shared scene: their rewards and their success."""
+"""The tasks that a table can hold: stock Meta-World classes, the objects that they need, and entries of the state."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
-import mujoco
 import numpy as np
+from metaworld.envs.sawyer_button_press_v3 import SawyerButtonPressEnvV3
 from metaworld.envs.sawyer_dial_turn_v3 import SawyerDialTurnEnvV3
 from metaworld.envs.sawyer_door_v3 import SawyerDoorEnvV3
 from metaworld.envs.sawyer_drawer_open_v3 import SawyerDrawerOpenEnvV3
+from metaworld.envs.sawyer_faucet_close_v3 import SawyerFaucetCloseEnvV3
+from metaworld.envs.sawyer_faucet_open_v3 import SawyerFaucetOpenEnvV3
+from metaworld.envs.sawyer_handle_press_v3 import SawyerHandlePressEnvV3
 from metaworld.envs.sawyer_lever_pull_v3 import SawyerLeverPullEnvV3
 from metaworld.envs.sawyer_plate_slide_v3 import SawyerPlateSlideEnvV3
+from metaworld.envs.sawyer_window_open_v3 import SawyerWindowOpenEnvV3
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
-from sb3_offline.envs.multimodal_metaworld.scene import TableScene
+Colour = tuple[float, float, float, float]
 
 
-class _OnSharedTable(SawyerXYZEnv):
+class Element(NamedTuple):
+    """A named element of an object's file, which would otherwise share its name with an element of another object."""
+
+    kind: str
+    """"geom", "joint" or "site"."""
+    parent: str
+    """Name of the body that holds it."""
+    name: str
+    """Its name in the file, which may be empty."""
+
+
+class Quantity(NamedTuple):
+    """One entry of a state: a coordinate of a body, geom or site (m), or a joint's position (m or rad)."""
+
+    kind: Literal["body", "geom", "site", "joint"]
+    name: str
+    axis: int = 0
+
+
+@dataclass(frozen=True)
+class TableObject:
     """
-    Comes before a stock class: it takes the simulation from a scene, leaves the arm where it is and the objects where the
-    scene has put them. `step` and `reset` of the stock class are never called.
+    An object of Meta-World's assets.
+
+    :param file: its MJCF file
+    :param dependencies: name of the file with its meshes and materials, without ``_dependencies.xml``
+    :param sites: name to position (m, relative to the object) of the sites that stock scenes add outside of the file
+    :param renamed: elements that get another name; no two names may clash on a table
+    :param start: joint to its position (m or rad) at the start of an episode, where that is not 0
+    :param colours: mesh or material to its colour, where success cannot be seen at 64 pixels in the stock colour
     """
 
-    _placement: Callable[[TableScene], np.ndarray]
-
-    def __init__(self, scene: TableScene) -> None:
-        self._scene = scene
-        super().__init__()
-        self._set_task_called = True
-        hand, claws = self.model.body("hand").id, [self.model.body(name).id for name in ("rightclaw", "leftclaw")]
-        self._hand_id, self._claw_ids = hand, claws
-
-    def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        return self._scene.model, self._scene.data
-
-    def _reset_hand(self, steps: int = 50) -> None:
-        self.init_tcp = self.tcp_center
-
-    def _get_state_rand_vec(self) -> np.ndarray:
-        return self._placement(self._scene)
-
-    def stock_observation(self) -> np.ndarray:
-        """
-        :return: (39,) float64, the part of the stock observation that rewards and scripted policies read: hand, gripper
-            opening, object position, and the goal at the end; zeros elsewhere. The goal never leaves the room.
-        """
-        right, left = self.data.xpos[self._claw_ids]
-        observation = np.zeros(39)
-        observation[:3] = self.data.xpos[self._hand_id]
-        observation[3] = min(np.linalg.norm(right - left) / 0.1, 1.0)
-        observation[4:7] = self._get_pos_objects()
-        observation[-3:] = self._target_pos
-        return observation
-
-    def judge(self, action: np.ndarray) -> tuple[float, bool]:
-        """
-        :param action: (4,) float in [-1, 1], the action that led here
-        :return: stock reward and success in the present state
-        """
-        reward, info = self.evaluate_state(self.stock_observation(), action)
-        return float(reward), bool(info["success"])
+    file: str
+    dependencies: str
+    sites: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    renamed: Mapping[Element, str] = field(default_factory=dict)
+    start: Mapping[str, float] = field(default_factory=dict)
+    colours: Mapping[str, Colour] = field(default_factory=dict)
 
 
-def _body_position(scene: TableScene, name: str) -> np.ndarray:
-    return scene.model.body(name).pos.copy()
+@dataclass(frozen=True)
+class StockTask:
+    """
+    A task as Meta-World defines it.
+
+    :param env_class: stock class, whose reward and success condition are used unmodified
+    :param objects: the objects it needs, by the names that `TABLES` gives positions for
+    :param state: what a state observation tells of the objects, by the names of its entries; names that end in "angle" are
+        angles in radians, all others lengths in metres
+    :param placement: from the positions of `objects`, in their order, to what the stock class would draw at random at a reset
+    :param aliases: names that the stock class looks up to the names that they have on the table
+    :param sets_joints: whether the stock class sets its joints at a reset; it must not where it takes them for the first ones
+        after the arm's, unless they are (`joints_first`). The scene sets all joints to their start in any case
+    :param joints_first: whether the joints are the first ones after the arm's
+    """
+
+    env_class: type[SawyerXYZEnv]
+    objects: Mapping[str, TableObject]
+    state: Mapping[str, Quantity]
+    placement: Callable[..., np.ndarray] = lambda *positions: np.concatenate(positions)
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    sets_joints: bool = True
+    joints_first: bool = False
 
 
-def _at(body: str) -> Callable[[TableScene], np.ndarray]:
-    return lambda scene: _body_position(scene, body)
+def _coordinates(name: str, kind: Literal["body", "geom", "site"], element: str, axes: str = "xy") -> dict[str, Quantity]:
+    return {f"{name}_{axis}": Quantity(kind, element, "xyz".index(axis)) for axis in axes}
 
 
-def _puck_and_goal(scene: TableScene) -> np.ndarray:
+def _puck_and_goal(channel: np.ndarray, goal: np.ndarray) -> np.ndarray:
     # Stock plate-slide has its puck's start at z = 0, though its body stands 15 mm higher.
-    return np.concatenate((_body_position(scene, "puck_channel") * (1.0, 1.0, 0.0), _body_position(scene, "puck_goal")))
+    return np.concatenate((channel * (1.0, 1.0, 0.0), goal))
 
 
-_STOCK: dict[str, tuple[type[SawyerXYZEnv], Callable[[TableScene], np.ndarray]]] = {
-    "dial-turn": (SawyerDialTurnEnvV3, _at("dial")),
-    "door-open": (SawyerDoorEnvV3, _at("door")),
-    "drawer-open": (SawyerDrawerOpenEnvV3, _at("drawer")),
-    "lever-pull": (SawyerLeverPullEnvV3, _at("lever")),
-    "plate-slide": (SawyerPlateSlideEnvV3, _puck_and_goal),
+_PUCK_NET: Colour = (0.85, 0.85, 0.85, 0.12)
+_OFF_WHITE: Colour = (0.95, 0.95, 0.9, 1.0)
+_BLUE: Colour = (0.1, 0.3, 0.9, 1.0)
+_GREEN: Colour = (0.1, 0.75, 0.2, 1.0)
+
+_FAUCET = TableObject(
+    "faucet.xml",
+    "faucet",
+    sites={"goal_open": (0.175, 0.0, 0.125), "goal_close": (-0.175, 0.0, 0.125)},
+    renamed={Element("joint", "faucet_link2", "knob_Joint_1"): "faucet_joint"},
+    colours={"faucet_red": _BLUE},
+)
+_FAUCET_STATE = {**_coordinates("faucet_tip", "site", "handleStartOpen"), "faucet_angle": Quantity("joint", "faucet_joint")}
+
+STOCK_TASKS: dict[str, StockTask] = {
+    "dial-turn": StockTask(
+        SawyerDialTurnEnvV3,
+        {"dial": TableObject("dial.xml", "dial", colours={"dialhead": _OFF_WHITE})},
+        {**_coordinates("dial", "body", "dial"), "dial_angle": Quantity("joint", "knob_Joint_1")},
+    ),
+    "door-open": StockTask(
+        SawyerDoorEnvV3,
+        {"door": TableObject("doorlockB.xml", "doorlock")},
+        {**_coordinates("door_handle", "geom", "handle"), "door_angle": Quantity("joint", "doorjoint")},
+    ),
+    "drawer-open": StockTask(
+        SawyerDrawerOpenEnvV3,
+        {
+            "drawer": TableObject(
+                "drawer.xml",
+                "drawer",
+                renamed={
+                    Element("geom", "drawer_link", "objGeom"): "drawer_handle",
+                    Element("joint", "drawer_link", "goal_slidey"): "drawer_slide",
+                },
+            )
+        },
+        {**_coordinates("drawer", "body", "drawer_link"), "drawer_slide": Quantity("joint", "drawer_slide")},
+    ),
+    "lever-pull": StockTask(
+        SawyerLeverPullEnvV3,
+        {"lever": TableObject("lever.xml", "lever")},
+        {**_coordinates("lever_tip", "site", "leverStart", "xyz"), "lever_angle": Quantity("joint", "LeverAxis")},
+    ),
+    "plate-slide": StockTask(
+        SawyerPlateSlideEnvV3,
+        {
+            "puck_channel": TableObject("puck.xml", "puck_goal"),
+            "puck_goal": TableObject("puck_goal.xml", "puck_goal", colours={"goal_net": _PUCK_NET}),
+        },
+        {**_coordinates("puck", "geom", "puck"), **_coordinates("puck_goal", "body", "puck_goal")},
+        placement=_puck_and_goal,
+        joints_first=True,
+    ),
+    "button-press": StockTask(
+        SawyerButtonPressEnvV3,
+        {
+            "button_box": TableObject(
+                "buttonbox.xml",
+                "buttonbox",
+                sites={"buttonStart": (0.0, -0.1935, 0.0), "hole": (0.0, -0.1, 0.0)},
+                colours={"btn_red": _OFF_WHITE},
+            )
+        },
+        {**_coordinates("button", "geom", "btnGeom"), "button_slide": Quantity("joint", "btnbox_joint")},
+        aliases={"box": "button_box"},
+        sets_joints=False,
+    ),
+    "faucet-close": StockTask(SawyerFaucetCloseEnvV3, {"faucetBase": _FAUCET}, _FAUCET_STATE),
+    "faucet-open": StockTask(SawyerFaucetOpenEnvV3, {"faucetBase": _FAUCET}, _FAUCET_STATE),
+    "handle-press": StockTask(
+        SawyerHandlePressEnvV3,
+        {
+            "handle_box": TableObject(
+                "handle_press.xml",
+                "handle_press",
+                sites={"goalPress": (0.0, -0.216, 0.075)},
+                renamed={Element("joint", "handle_link", ""): "handle_slide"},
+                colours={"hdlprs_red": _GREEN},
+            )
+        },
+        {**_coordinates("handle", "site", "handleStart"), "handle_slide": Quantity("joint", "handle_slide")},
+        aliases={"box": "handle_box"},
+        sets_joints=False,
+    ),
+    "window-open": StockTask(
+        SawyerWindowOpenEnvV3,
+        {"window": TableObject("window_horiz.xml", "window", colours={"window_white": _OFF_WHITE})},
+        {**_coordinates("window_handle", "site", "handleOpenStart"), "window_slide": Quantity("joint", "window_slide")},
+    ),
 }
-
-
-TASKS = tuple(_STOCK)
-"""Names of the tasks, in the order of every per-task array."""
-
-
-def make_tasks(scene: TableScene) -> list[Any]:
-    """
-    :param scene: the simulation that they share
-    :return: one judge for each task, in the order of `TASKS`
-    """
-    return [
-        type(stock.__name__, (_OnSharedTable, stock), {"_placement": staticmethod(at)})(scene) for stock, at in _STOCK.values()
-    ]
+"""Every task that a table can hold, by Meta-World's name."""
