@@ -158,3 +158,13 @@ def add_episode(writer: DatasetWriter, episode: TaskEpisode) -> None:
         seed=episode.seed,
         source=episode.task,
     )
+
+
+def check_tasks(tasks: Sequence[str], table: str = "paper") -> None:
+    """
+    :param tasks: raises ``ValueError`` unless the table has all of them
+    :param table: name of the table
+    """
+    known = find_table(table).tasks
+    if unknown := set(tasks) - set(known):
+        raise ValueError(f"Unknown tasks {sorted(unknown)} of table {table!r}; choose from {', '.join(known)}.")
