@@ -126,9 +126,10 @@ def _cut(
     for name, array in extras.items():
         # The row that the step led to, and the row of the reset beside it, as in `recorded.join_episodes`
         arrays[f"extras/{name}"] = array[~first]
-        reset = np.zeros_like(arrays[f"extras/{name}"])
-        reset[first[kept]] = array[first]
-        arrays[f"extras/reset.{name}"] = reset
+        if array[first].any():
+            reset = np.zeros_like(arrays[f"extras/{name}"])
+            reset[first[kept]] = array[first]
+            arrays[f"extras/reset.{name}"] = reset
     prefix = "extras/"
     header.extras = {n.removeprefix(prefix): (a.shape[1:], a.dtype) for n, a in arrays.items() if n.startswith(prefix)}
     fields, final = header.fields(), np.cumsum(lengths) - 1

@@ -209,7 +209,7 @@ def _checked(episode: Episode, header: Header) -> dict[str, np.ndarray]:
 def _extras(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
     """
     :return: (N, ...) those further arrays that all episodes have, with the same shape and dtype. The row of a reset is kept
-        under ``reset.<name>`` in the first step of its episode, as for Minari
+        under ``reset.<name>`` in the first step of its episode, as for Minari, if it holds any information
     """
     joined: dict[str, np.ndarray] = {}
     lengths = [len(episode.steps["actions"]) for episode in episodes]
@@ -222,7 +222,7 @@ def _extras(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
             warnings.warn(f"{place}: does not have one row of one shape for each step of every episode; it is left out.")
             continue
         joined[name] = np.concatenate([part[len(part) - n :] for part, n in zip(parts, lengths, strict=True)])
-        if rows == {1}:
+        if rows == {1} and any(part[0].any() for part in parts):
             reset = np.zeros_like(joined[name])
             reset[np.cumsum(lengths) - lengths] = np.stack([part[0] for part in parts])
             joined[f"reset.{name}"] = reset
