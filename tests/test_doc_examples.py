@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from format_files import write_aloha, write_maniskill, write_robomimic
 from PIL import Image
 from stable_baselines3 import SAC
 from stable_baselines3.common import callbacks, evaluation
@@ -41,6 +42,9 @@ FILES = {
     "episodes.h5": "pixels.h5",
     "images_of_success/": "images",
     "rollouts.npz": "rollouts.npz",
+    "lift.hdf5": "robomimic.hdf5",
+    "aloha_sim_insertion/": "aloha",
+    "trajectory.h5": "maniskill.h5",
 }
 
 #: Code before a page's blocks, for what it leaves to the reader or to another page
@@ -123,6 +127,9 @@ def stand_ins(tmp_path_factory):
     # Two episodes of Pendulum-v1 as imitation writes them
     rollouts = {"obs": np.zeros((402, 3)), "acts": np.zeros((400, 1)), "rews": np.zeros(400), "terminal": np.ones(2, bool)}
     np.savez(folder / "rollouts.npz", indices=[200], **rollouts)
+    write_robomimic(folder / "robomimic.hdf5", image_shape=(84, 84, 3))
+    write_aloha(folder / "aloha", joints=14)
+    write_maniskill(folder / "maniskill.h5")
     return folder
 
 

@@ -25,6 +25,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
+from sb3_offline.common.choices import CountingFromZero
 from sb3_offline.common.fast import encode, linear_heads, mlp, state_action_values
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
@@ -34,7 +35,7 @@ ACTION_LIMIT = 0.999
 SQUASHING_EPSILON = 1e-6
 
 
-class EncodingActor(BasePolicy):
+class EncodingActor(CountingFromZero, BasePolicy):
     """
     Base class of actors, whose encoder may be the critic's.
 
@@ -154,7 +155,7 @@ def _log_density(actions: th.Tensor, log_std: th.Tensor, squared_noise: th.Tenso
     return -terms.sum(dim=-1) - 0.5 * math.log(2 * math.pi) * actions.shape[-1]
 
 
-class OfflineCritic(ContinuousCritic):
+class OfflineCritic(CountingFromZero, ContinuousCritic):
     """
     Critic networks on one encoder, which their loss trains.
 

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_offline.common.choices import counted_from_zero
 from sb3_offline.common.torch_layers import StandardizedExtractor
 
 
@@ -40,7 +41,7 @@ class ObservationVectors:
         :param observations: a batch as the buffer gives it
         :return: ``(batch, n_entries)``
         """
-        processed = preprocess_obs(observations, self.space)  # type: ignore[arg-type]
+        processed = preprocess_obs(counted_from_zero(observations, self.space), self.space)  # type: ignore[arg-type]
         parts = processed if isinstance(processed, dict) else {"": processed}
         vectors = [self.scales[key].to(x.device)(x) if key in self.scales else x.flatten(1) for key, x in parts.items()]
         return th.cat(vectors, dim=1)

@@ -4,13 +4,14 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_offline.common.choices import CountingFromZero
 
-class RewardClassifier(BaseModel):
+
+class RewardClassifier(CountingFromZero):
     """
     A classifier that tells success examples from the dataset's observations. It has its own encoder and sees no action.
 
