@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set, ValuesView
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +202,7 @@ def _open_each(dataset: Any) -> Iterator[OfflineDataset]:
         if not paths and glob.has_magic(pattern):
             raise DatasetError(pattern, "dataset", "matches no file", "Check the pattern")
         yield from (OfflineDataset(path) for path in paths or [pattern])
-    elif isinstance(dataset, Iterable) and not isinstance(dataset, Mapping) and recognize(Probe(dataset)) is None:
+    elif isinstance(dataset, Sequence | Set | ValuesView | Iterator) and recognize(Probe(dataset)) is None:
         for part in dataset:
             yield from _open_each(part)
     else:

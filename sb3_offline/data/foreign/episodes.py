@@ -118,18 +118,22 @@ def guess_observation_space(observations: np.ndarray) -> spaces.Box:
     return spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
 
 
-def guess_action_space(actions: np.ndarray, path: str | os.PathLike) -> spaces.Box:
+def guess_action_space(
+    actions: np.ndarray, path: str | os.PathLike, whose: str = "data of this format", name: str = "actions"
+) -> spaces.Box:
     """
     :param actions: (n, ...) actions without a declared space
     :param path: file for error messages
+    :param whose: name of the format for error messages, e.g. "LeRobot data"
+    :param name: name of the actions in the file, for error messages
     :return: a Box of their shape with the bounds [-1, 1]
     :raises DatasetError: if the actions are integers, or if they exceed these bounds
     """
     remedy = "Open it with OfflineDataset(path, action_space=...), or convert it with --env ID"
     if actions.dtype.kind != "f":
-        problem = f"has dtype {actions.dtype}, and data of this format do not declare which actions there are"
-        raise DatasetError(path, "actions", problem, remedy)
+        problem = f"has dtype {actions.dtype}, and {whose} do not declare which actions there are"
+        raise DatasetError(path, name, problem, remedy)
     if np.abs(actions).max() > 1 + 1e-5:
-        problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and data of this format declare no bounds"
-        raise DatasetError(path, "actions", problem, remedy)
+        problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and {whose} declare no bounds"
+        raise DatasetError(path, name, problem, remedy)
     return spaces.Box(-1.0, 1.0, actions.shape[1:], np.float32)
