@@ -1,5 +1,7 @@
 """Data of robots and of other offline learners: LeRobot, d3rlpy, pickled trajectories, RLDS, and live objects."""
 
+import io
+import json
 import pickle
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from data_files import BOTH, write_dataset
 from gymnasium import spaces
+from PIL import Image
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps, ProgressBarCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -247,3 +250,249 @@ def test_bars_of_sb3_count_gradient_steps(nested):
 
 
 # ----------------------------------------------------------------- LeRobot
+
+FPS = 10
+LENGTHS = (6, 4, 5)
+VIDEO = {"dtype": "video", "shape": [40, 48, 3], "names": ["height", "width", "channels"]}
+
+
+def frame_color(row: int, camera: int = 0) -> tuple[int, int, int]:
+    return (40 + 10 * row, 200 - 10 * row, 50 + 100 * camera)
+
+
+def write_video(path: Path, rows: list[int], camera: int, start: int = 0) -> None:
+    av = pytest.importorskip("av")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=FPS)
+        stream.width, stream.height, stream.pix_fmt, stream.gop_size = 48, 40, "yuv420p", 3
+        for row in rows:
+            image = np.full((40, 48, 3), frame_color(row, camera), np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def write_lerobot(
+    root: Path, version: str, *, cameras: tuple[str, ...] = (), lengths: tuple[int, ...] = LENGTHS, **changes: Any
+) -> dict[str, np.ndarray]:
+    """
+    A dataset in LeRobot's published layout. Version 3 puts all episodes but the last into one file.
+
+    :param changes: columns to replace, or to leave out (``None``)
+    :return: the columns
+    """
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    n, rng = sum(lengths), np.random.default_rng(0)
+    episode_index = np.repeat(np.arange(len(lengths)), lengths)
+    frame_index = np.concatenate([np.arange(length) for length in lengths])
+    ends = np.append(episode_index[1:] != episode_index[:-1], True)
+    columns: dict[str, Any] = {
+        "observation.state": rng.normal(size=(n, 3)),
+        "action": rng.uniform(-1, 1, (n, 2)).astype(np.float32),
+        "next.reward": np.arange(n, dtype=np.float32),
+        "next.success": ends & (episode_index != 1),
+        "next.done": ends,
+        "timestamp": (frame_index / FPS).astype(np.float32),
+        "frame_index": frame_index,
+        "episode_index": episode_index,
+        "index": np.arange(n),
+        "task_index": episode_index % 2,
+    }
+    columns = {name: column for name, column in {**columns, **changes}.items() if column is not None}
+    features: dict[str, Any] = {
+        name: (
+            {"dtype": str(column.dtype), "shape": list(column.shape[1:]) or [1], "names": None}
+            if isinstance(column, np.ndarray)
+            else {"dtype": "image", "shape": [4, 5, 3], "names": ["height", "width", "channel"]}
+        )
+        for name, column in columns.items()
+    } | {f"observation.images.{name}": VIDEO for name in cameras}
+    rows = [{} for _ in range(n)]
+    for name, column in columns.items():
+        for row, value in zip(rows, column, strict=True):
+            row[name] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    is_old = version < "v3"
+    files = [[e] for e in range(len(lengths))] if is_old else [list(range(len(lengths) - 1)), [len(lengths) - 1]]
+    episodes = [{"episode_index": e, "tasks": [f"task {e % 2}"], "length": length} for e, length in enumerate(lengths)]
+    for index, members in enumerate(file for file in files if file):
+        chunk = f"chunk-{index // 2:03d}"  # two files in each chunk
+        name = f"episode_{index:06d}" if is_old else f"file-{index:03d}"
+        path = root / "data" / chunk / f"{name}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist([row for row in rows if row["episode_index"] in members]), path)
+        numbers = [row for row in range(n) if episode_index[row] in members]
+        for place, camera in enumerate(cameras):
+            key = f"observation.images.{camera}"
+            folder = f"videos/{chunk}/{key}" if is_old else f"videos/{key}/{chunk}"
+            write_video(root / folder / f"{name}.mp4", numbers, place)
+        for member in members if not is_old else []:
+            where = {"chunk_index": index // 2, "file_index": index}
+            start = (int(np.argmax(episode_index == member)) - numbers[0]) / FPS
+            episodes[member] |= {f"data/{name}": value for name, value in where.items()}
+            for camera in cameras:
+                at = {**where, "from_timestamp": start}
+                episodes[member] |= {f"videos/observation.images.{camera}/{name}": value for name, value in at.items()}
+    meta = root / "meta"
+    tasks = [{"task_index": index, "task": f"task {index}"} for index in range(2)]
+    if is_old:
+        meta.mkdir()
+        (meta / "episodes.jsonl").write_text("\n".join(map(json.dumps, episodes)))
+        (meta / "tasks.jsonl").write_text("\n".join(map(json.dumps, tasks)))
+    else:
+        (meta / "episodes" / "chunk-000").mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist(episodes), meta / "episodes" / "chunk-000" / "file-000.parquet")
+        pq.write_table(pa.Table.from_pylist(tasks), meta / "tasks.parquet")
+    paths = {
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    }
+    info = {
+        "codebase_version": version,
+        "robot_type": "so100",
+        "fps": FPS,
+        "chunks_size": 2,
+        "total_episodes": len(lengths),
+        "features": features,
+        **(paths if is_old else {}),
+    }
+    (meta / "info.json").write_text(json.dumps(info))
+    return columns
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_lerobot(tmp_path, version):
+    columns = write_lerobot(tmp_path / "robot", version)
+    dataset = OfflineDataset(tmp_path / "robot")
+    # The second episode did not succeed: it was truncated, and loses the step after which nothing was seen
+    assert dataset.lengths.tolist() == [6, 3, 5] and dataset.guessed_actions
+    assert np.flatnonzero(dataset.terminated).tolist() == [5, 13] and np.flatnonzero(dataset.truncated).tolist() == [8]
+    assert dataset.sources == ["task 0", "task 1"] and dataset.source.tolist() == [0, 1, 0]
+    kept = np.delete(np.arange(15), 9)
+    np.testing.assert_array_equal(dataset.rewards, columns["next.reward"][kept])
+    np.testing.assert_array_equal(dataset.success, columns["next.success"][kept])
+    np.testing.assert_array_equal(dataset.actions, columns["action"][kept])
+    rows = [*range(6), 5, *range(6, 10), *range(10, 15), 14]
+    np.testing.assert_array_equal(dataset.observations, columns["observation.state"][rows].astype(np.float32))
+
+
+def test_lerobot_without_the_optional_columns(tmp_path):
+    write_lerobot(tmp_path / "a", "v2.1", **{"next.success": None, "next.reward": None, "next.done": None}, lengths=(4,))
+    dataset = OfflineDataset(tmp_path / "a")
+    assert dataset.lengths.tolist() == [3] and dataset.rewards is None and dataset.success is None
+    write_lerobot(tmp_path / "b", "v3.0", **{"next.success": None, "effort": np.ones((15, 2)), "timestamp": None})
+    with pytest.warns(UserWarning, match=r"next\.done: does not tell terminations from time limits"):
+        assert OfflineDataset(tmp_path / "b").terminated.sum() == 3
+    limited = OfflineDataset(tmp_path / "b", max_episode_steps=6)
+    assert limited.lengths.tolist() == [5, 4, 5] and limited.extras["effort"].shape == (14, 2)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_videos_of_lerobot_are_decoded_once_by_convert(tmp_path, version):
+    write_lerobot(tmp_path / "robot", version, cameras=("front", "wrist"))
+    dataset = OfflineDataset(tmp_path / "robot")
+    assert list(dataset.observation_space) == ["images_front", "images_wrist", "state"]
+    rows = [*range(6), 5, *range(6, 10), *range(10, 15), 14]
+    for camera, key in enumerate(("images_front", "images_wrist")):
+        images = dataset.observations[key]
+        wanted = np.array([frame_color(row, camera) for row in rows])
+        assert images.shape == (17, 40, 48, 3)
+        assert np.abs(np.asarray(images).mean((1, 2)) - wanted).max() < 5  # half of what tells rows apart; the codec is lossy
+        for order in (slice(5, 9), np.array([16, 3, 3, 0]), slice(0, 2)):
+            np.testing.assert_array_equal(images[order], images[:][order])
+        with pytest.raises(DatasetError, match=r"images: are encoded, .*sb3-offline convert .*robot data.h5"):
+            images.take(np.arange(3))
+    main(["convert", str(tmp_path / "robot"), str(tmp_path / "d.h5")])
+    converted = OfflineDataset(tmp_path / "d.h5")
+    assert converted.storage == "contiguous"
+    for name, array in dataset.arrays.items():
+        np.testing.assert_array_equal(np.asarray(array), np.asarray(converted.arrays[name]), err_msg=name)
+    BC("MultiInputPolicy", None, dataset=tmp_path / "robot", **SMALL).learn(1)
+    space = spaces.Dict({key: dataset.observation_space[key] for key in ("images_wrist", "state")})
+    assert OfflineDataset(tmp_path / "robot", observation_space=space).observations.keys() == space.spaces.keys()
+
+
+def test_encoded_images_of_lerobot(tmp_path):
+    images = []
+    for row in range(15):
+        file = io.BytesIO()
+        Image.new("RGB", (5, 4), frame_color(row)).save(file, "PNG")
+        images.append({"bytes": file.getvalue(), "path": None})
+    write_lerobot(tmp_path / "robot", "v3.0", **{"observation.image": images, "observation.state": None})
+    dataset = OfflineDataset(tmp_path / "robot")
+    assert dataset.observation_space == spaces.Box(0, 255, (4, 5, 3), np.uint8)  # the only key
+    assert np.asarray(dataset.observations)[12, 0, 0].tolist() == list(frame_color(11))
+
+
+def damage(root: Path, what: str) -> None:
+    info = json.loads((root / "meta" / "info.json").read_text())
+    video = root / "videos" / "chunk-000" / "observation.images.front" / "episode_000001.mp4"
+    if what == "video":
+        video.unlink()
+    elif what == "half a video":
+        write_video(video, [6, 7], 0)
+    elif what == "no video":
+        video.write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    elif what == "table":
+        (root / "data" / "chunk-000" / "episode_000001.parquet").unlink()
+    elif what == "half a table":
+        path = root / "data" / "chunk-000" / "episode_000001.parquet"
+        path.write_bytes(path.read_bytes()[:99])
+    elif what == "episodes":
+        (root / "meta" / "episodes.jsonl").unlink()
+    elif what == "length":
+        text = (root / "meta" / "episodes.jsonl").read_text()
+        (root / "meta" / "episodes.jsonl").write_text(text.replace('"length": 4', '"length": 9'))
+    else:
+        if what == "depth":
+            info["features"]["observation.images.front"] = {**VIDEO, "info": {"video.is_depth_map": True}}
+        elif what == "channels":
+            info["features"]["observation.images.front"] = {**VIDEO, "shape": [3, 40, 48], "names": None}
+        elif what == "size":
+            info["features"]["observation.images.front"] = {**VIDEO, "shape": [64, 64, 3]}
+        elif what == "action":
+            info["features"]["action.arm"] = info["features"].pop("action")
+        elif what == "version":
+            info["codebase_version"] = "v1.6"
+        elif what == "width":
+            info["features"]["observation.state"]["shape"] = [7]
+        (root / "meta" / "info.json").write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("video", r"episode_000001\.mp4: observation\.images\.front: is missing .* or leave the camera out"),
+        ("half a video", r"episode_000001\.mp4: observation\.images\.front: has no frame at .* \(2 frames"),
+        ("no video", r"episode_000001\.mp4: observation\.images\.front: cannot be decoded"),
+        ("table", r"episode_000001\.parquet: file: is missing"),
+        ("half a table", r"episode_000001\.parquet: file: is no Parquet table"),
+        ("episodes", r"episodes\.jsonl: file: is missing"),
+        ("length", "episode 1: has 4 rows in the tables, but LeRobot's metadata say 9"),
+        ("size", r"has frames of shape \(40, 48, 3\), but info\.json declares \(64, 64, 3\)"),
+        ("action", r"features: action: is missing, but there are action\.arm"),
+        ("version", r"codebase_version: is v1\.6, and LeRobot's versions"),
+        ("width", r"observation\.state: has 3 values in a row, but info\.json declares the shape \(7,\)"),
+    ],
+)
+def test_damaged_lerobot_data(tmp_path, what, message):
+    write_lerobot(tmp_path / "robot", "v2.1", cameras=("front",))
+    damage(tmp_path / "robot", what)
+    with pytest.raises(DatasetError, match=message):
+        np.asarray(OfflineDataset(tmp_path / "robot").observations["images_front"])
+
+
+def test_cameras_of_other_kinds(tmp_path):
+    write_lerobot(tmp_path / "robot", "v2.1", cameras=("front",))
+    damage(tmp_path / "robot", "channels")
+    assert np.asarray(OfflineDataset(tmp_path / "robot").observations["images_front"]).shape == (17, 40, 48, 3)
+    damage(tmp_path / "robot", "depth")
+    with pytest.warns(UserWarning, match=r"observation\.images\.front: holds depth images.* left out"):
+        assert OfflineDataset(tmp_path / "robot").observation_space == spaces.Box(-np.inf, np.inf, (3,))
+
+
+def test_actions_of_lerobot_need_bounds(tmp_path):
+    write_lerobot(tmp_path / "robot", "v3.0", action=np.full((15, 2), 9.0))
+    with pytest.raises(DatasetError, match=r"action: reaches from 9 to 9, and LeRobot data declare no.*action_space="):
+        OfflineDataset(tmp_path / "robot")
+    space = spaces.Box(-180, 180, (2,))
+    assert OfflineDataset(tmp_path / "robot", action_space=space).action_space == space
