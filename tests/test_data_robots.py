@@ -54,6 +54,12 @@ def test_pickled_trajectories(tmp_path, protocol):
     np.testing.assert_array_equal(dataset.observations, wanted)
     np.testing.assert_array_equal(dataset.rewards, np.concatenate([t["rewards"] for t in given]).astype(np.float32))
     np.testing.assert_array_equal(open_datasets(given)[0].observations, wanted)  # a list is one dataset, not several
+    objects = np.empty(2, dtype=object)
+    objects[:] = given
+    flat = {name: np.concatenate([t[name] for t in given]) for name in given[0]}
+    for other in (tuple(given), objects, flat):  # the last one has D4RL's names
+        (tmp_path / "other").write_bytes(pickle.dumps(other, protocol))
+        np.testing.assert_array_equal(OfflineDataset(tmp_path / "other").observations, wanted)
 
 
 def test_trajectories_of_other_kinds():
@@ -437,6 +443,8 @@ def damage(root: Path, what: str) -> None:
     elif what == "half a table":
         path = root / "data" / "chunk-000" / "episode_000001.parquet"
         path.write_bytes(path.read_bytes()[:99])
+    elif what == "info":
+        (root / "meta" / "info.json").write_text("{")
     elif what == "episodes":
         (root / "meta" / "episodes.jsonl").unlink()
     elif what == "length":
@@ -466,6 +474,8 @@ def damage(root: Path, what: str) -> None:
         ("no video", r"episode_000001\.mp4: observation\.images\.front: cannot be decoded"),
         ("table", r"episode_000001\.parquet: file: is missing"),
         ("half a table", r"episode_000001\.parquet: file: is no Parquet table"),
+        ("info", r"info\.json: file: is missing from this LeRobot dataset, or is no JSON"),
+        ("bounds", r"actions: has shape \(14, 2\), expected \(n, 3\)"),
         ("episodes", r"episodes\.jsonl: file: is missing"),
         ("length", "episode 1: has 4 rows in the tables, but LeRobot's metadata say 9"),
         ("size", r"has frames of shape \(40, 48, 3\), but info\.json declares \(64, 64, 3\)"),
@@ -478,7 +488,8 @@ def test_damaged_lerobot_data(tmp_path, what, message):
     write_lerobot(tmp_path / "robot", "v2.1", cameras=("front",))
     damage(tmp_path / "robot", what)
     with pytest.raises(DatasetError, match=message):
-        np.asarray(OfflineDataset(tmp_path / "robot").observations["images_front"])
+        space = spaces.Box(-1, 1, (3,)) if what == "bounds" else None
+        np.asarray(OfflineDataset(tmp_path / "robot", action_space=space).observations["images_front"])
 
 
 def test_cameras_of_other_kinds(tmp_path):

@@ -23,7 +23,8 @@ class OfflineDataset:
     """
     A dataset file of format version 1, or data of another library: D4RL-style HDF5 files or dicts, Minari datasets
     (``minari:namespace/name-v0``, or the folder), replay buffers of Stable-Baselines3 (in memory or pickled; open only pickles
-    that you trust), and rollouts of `imitation` (``.npz``, or a folder). The format is recognised by the contents. Opening
+    that you trust), rollouts of `imitation` (``.npz``, or a folder), folders of LeRobot, files of d3rlpy, and lists of
+    trajectory dicts (in memory or pickled). The format is recognised by the contents. Opening
     checks the data and raises ``DatasetError``, which names the file, the field and the remedy.
 
     Arrays are flat over all steps. Episode e has its steps at ``step_starts[e] + arange(lengths[e])``, and its observations,

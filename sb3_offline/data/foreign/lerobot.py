@@ -18,6 +18,7 @@ from sb3_offline.data.format import Header
 from sb3_offline.data.spaces import subspaces
 
 INFO = "meta/info.json"
+METADATA = ("info.json", "episodes.jsonl", "episodes", "tasks.jsonl", "tasks.parquet")
 OLD_INFO = "meta_data/info.json"  # of versions 1.x
 PATHS = {
     "v2": {
@@ -58,12 +59,13 @@ class Table(NamedTuple):
 def recognizes(probe: Probe) -> bool:
     """
     :param probe: a path or an object
-    :return: whether it is a folder with ``meta/info.json`` that describes features
+    :return: whether it is a folder with LeRobot's metadata, of which some may be missing
     """
     if probe.kind != "folder":
         return False
-    info = probe.json(INFO) if "meta" in probe.names else probe.json(OLD_INFO)
-    return isinstance(info, dict) and ("features" in info or "codebase_version" in info)
+    if "meta_data" in probe.names:
+        return isinstance(probe.json(OLD_INFO), dict)
+    return "meta" in probe.names and any((probe.path / "meta" / name).exists() for name in METADATA)
 
 
 def read(probe: Probe, options: Options) -> Foreign:
@@ -98,7 +100,9 @@ def read(probe: Probe, options: Options) -> Foreign:
     shapes = {key: _image_shape(table, name) for key, name in keys.items() if _is_image(features[name])}
     space = options.observation_space or _space(vectors, shapes)
     action_space = options.action_space or guess_action_space(actions, root, "LeRobot data", "action")
-    steps: dict[str, np.ndarray] = {"actions": actions.reshape(n, *(action_space.shape or ()))}
+    if action_space.shape == () and actions.shape == (n, 1):
+        actions = actions[:, 0]
+    steps: dict[str, np.ndarray] = {"actions": actions}
     ends = np.zeros(n, dtype=bool)
     ends[np.cumsum(table.lengths) - 1] = True
     steps |= _labels(table, ends, options)
@@ -148,7 +152,10 @@ def read(probe: Probe, options: Options) -> Foreign:
 def _read_tables(probe: Probe) -> Table:
     """:return: the tables of all episodes, checked against the metadata"""
     root, info = probe.path, probe.json(INFO)
-    version = str((info or probe.json(OLD_INFO)).get("codebase_version", "v3.0"))
+    described = info or probe.json(OLD_INFO)
+    if not isinstance(described, dict):
+        raise DatasetError(root / INFO, "file", "is missing from this LeRobot dataset, or is no JSON", DOWNLOAD)
+    version = str(described.get("codebase_version", "v3.0"))
     major = version.split(".")[0] if version.startswith("v") else f"v{version.split('.')[0]}"
     if info is None or major not in PATHS:
         problem = f"is {version}, and LeRobot's versions 2.0, 2.1 and 3.0 can be read"

@@ -13,6 +13,8 @@ from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.foreign.base import Foreign, Format, Options
+from sb3_offline.data.foreign.d4rl import read as read_d4rl
+from sb3_offline.data.foreign.d4rl import recognizes as recognizes_d4rl
 from sb3_offline.data.foreign.episodes import (
     cut_episodes,
     follows,
@@ -28,6 +30,8 @@ REQUIRED = ("observations", "actions")
 PER_STEP = ("rewards", "terminals", "timeouts", "dones", "success")
 #: Other names of the same arrays
 ALIASES = {"terminals": "terminated", "timeouts": "truncated"}
+#: What a pickle of a list, a dict, a tuple, or an array of objects begins with
+CONTAINERS = ("list", "dict", "numpy._core.multiarray._reconstruct", "numpy.core.multiarray._reconstruct")
 # Reading the opcodes of a pickle stops here. The keys of the first trajectory come within a few hundred, if its values are
 # arrays.
 MAX_OPCODES = 20_000
@@ -47,12 +51,12 @@ OLD_MODULES = {"__builtin__": "builtins"}
 def recognizes(probe: Probe) -> bool:
     """
     :param probe: a path or an object
-    :return: whether it is a list of dicts with observations and actions, or a pickle of such a list
+    :return: whether it is a list of dicts with observations and actions, or a pickle of such a list or of such a dict
     """
     if probe.is_object:
         given = probe.given
         return isinstance(given, list | tuple) and len(given) > 0 and all(_is_trajectory(part) for part in given)
-    return probe.pickled == "list" and _first_texts(probe)
+    return probe.pickled in CONTAINERS and _first_texts(probe)
 
 
 def _is_trajectory(value: Any) -> bool:
@@ -86,7 +90,8 @@ def read(probe: Probe, options: Options) -> Foreign:
     If a trajectory has one more observation than actions, it holds its last observation. Otherwise ``next_observations`` do.
     Without either, see :func:`~sb3_offline.data.foreign.episodes.cut_episodes`.
 
-    Unpickling a file runs no code: a pickle that contains anything but arrays, numbers and texts is refused.
+    Unpickling a file runs no code: a pickle that contains anything but arrays, numbers and texts is refused. A pickled dict is
+    one trajectory, or D4RL's arrays.
 
     :param probe: the list or the file
     :param options: ``observation_space`` (default: unbounded, 0 to 255 for uint8, of the data's shape), ``action_space``
@@ -94,6 +99,14 @@ def read(probe: Probe, options: Options) -> Foreign:
     :return: the data
     """
     given = probe.given if probe.is_object else _unpickle(probe)
+    if isinstance(given, np.ndarray):
+        given = given.tolist()
+    if isinstance(given, Mapping):
+        unpickled = Probe(given)
+        unpickled.path = probe.path
+        if recognizes_d4rl(unpickled):
+            return read_d4rl(unpickled, options)
+        given = [given]
     if not isinstance(given, list | tuple) or not given or not all(_is_trajectory(part) for part in given):
         problem = f"does not hold a list of dicts that all have {' and '.join(REQUIRED)}"
         raise DatasetError(probe.path, "trajectories", problem, "Check how the trajectories were written")
@@ -115,7 +128,7 @@ def join_trajectories(
     parts = [part for part in parts if len(part["actions"])]
     if not parts:
         raise DatasetError(path, "actions", "holds no step", "Check how the trajectories were written")
-    for name in parts[0].keys() | {name for part in parts for name in part}:
+    for name in sorted({name for part in parts for name in part}):
         having = [index for index, part in enumerate(parts) if name in part]
         if len(having) < len(parts):
             without = next(index for index in range(len(parts)) if index not in having)
