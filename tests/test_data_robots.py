@@ -429,41 +429,44 @@ def test_encoded_images_of_lerobot(tmp_path):
     assert np.asarray(dataset.observations)[12, 0, 0].tolist() == list(frame_color(11))
 
 
+FRONT = "observation.images.front"
+#: Changes of features in info.json, by what is damaged; ``None`` removes one
+WRONG_FEATURES: dict[str, dict[str, Any]] = {
+    "depth": {FRONT: {**VIDEO, "info": {"video.is_depth_map": True}}},
+    "channels": {FRONT: {**VIDEO, "shape": [3, 40, 48], "names": None}},
+    "size": {FRONT: {**VIDEO, "shape": [64, 64, 3]}},
+    "action": {"action": None, "action.arm": {"dtype": "float32", "shape": [2]}},
+    "width": {"observation.state": {"dtype": "float32", "shape": [7]}},
+}
+
+
 def damage(root: Path, what: str) -> None:
-    info = json.loads((root / "meta" / "info.json").read_text())
-    video = root / "videos" / "chunk-000" / "observation.images.front" / "episode_000001.mp4"
-    if what == "video":
-        video.unlink()
-    elif what == "half a video":
-        write_video(video, [6, 7], 0)
-    elif what == "no video":
-        video.write_bytes(b"version https://git-lfs.github.com/spec/v1")
-    elif what == "table":
-        (root / "data" / "chunk-000" / "episode_000001.parquet").unlink()
-    elif what == "half a table":
-        path = root / "data" / "chunk-000" / "episode_000001.parquet"
-        path.write_bytes(path.read_bytes()[:99])
-    elif what == "info":
-        (root / "meta" / "info.json").write_text("{")
-    elif what == "episodes":
-        (root / "meta" / "episodes.jsonl").unlink()
-    elif what == "length":
-        text = (root / "meta" / "episodes.jsonl").read_text()
-        (root / "meta" / "episodes.jsonl").write_text(text.replace('"length": 4', '"length": 9'))
-    else:
-        if what == "depth":
-            info["features"]["observation.images.front"] = {**VIDEO, "info": {"video.is_depth_map": True}}
-        elif what == "channels":
-            info["features"]["observation.images.front"] = {**VIDEO, "shape": [3, 40, 48], "names": None}
-        elif what == "size":
-            info["features"]["observation.images.front"] = {**VIDEO, "shape": [64, 64, 3]}
-        elif what == "action":
-            info["features"]["action.arm"] = info["features"].pop("action")
-        elif what == "version":
-            info["codebase_version"] = "v1.6"
-        elif what == "width":
-            info["features"]["observation.state"]["shape"] = [7]
-        (root / "meta" / "info.json").write_text(json.dumps(info))
+    pq = pytest.importorskip("pyarrow.parquet")
+    meta, info = root / "meta", json.loads((root / "meta" / "info.json").read_text())
+    table = root / "data" / "chunk-000" / "episode_000001.parquet"
+    video = root / "videos" / "chunk-000" / FRONT / "episode_000001.mp4"
+    if what in WRONG_FEATURES:
+        features = {**info["features"], **WRONG_FEATURES[what]}
+        info["features"] = {name: feature for name, feature in features.items() if feature}
+        (meta / "info.json").write_text(json.dumps(info))
+        return
+    how = {
+        "video": lambda: video.unlink(),
+        "half a video": lambda: write_video(video, [6, 7], 0),
+        "no video": lambda: video.write_bytes(b"version https://git-lfs.github.com/spec/v1"),
+        "table": lambda: table.unlink(),
+        "half a table": lambda: table.write_bytes(table.read_bytes()[:99]),
+        "no index": lambda: pq.write_table(pq.read_table(table).drop(["episode_index"]), table),
+        "info": lambda: (meta / "info.json").write_text("{"),
+        "version": lambda: (meta / "info.json").write_text(json.dumps({**info, "codebase_version": "v1.6"})),
+        "episodes": lambda: (meta / "episodes.jsonl").unlink(),
+        "odd lines": lambda: (meta / "episodes.jsonl").write_text("[1, 2]"),
+        "length": lambda: (meta / "episodes.jsonl").write_text(
+            (meta / "episodes.jsonl").read_text().replace('"length": 4', '"length": 9')
+        ),
+        "bounds": lambda: None,
+    }
+    how[what]()
 
 
 @pytest.mark.parametrize(
@@ -477,6 +480,8 @@ def damage(root: Path, what: str) -> None:
         ("info", r"info\.json: file: is missing from this LeRobot dataset, or is no JSON"),
         ("bounds", r"actions: has shape \(14, 2\), expected \(n, 3\)"),
         ("episodes", r"episodes\.jsonl: file: is missing"),
+        ("no index", r"data: episode_index: is missing in some of LeRobot's tables"),
+        ("odd lines", "meta: episode_index: is missing from the metadata of an episode"),
         ("length", "episode 1: has 4 rows in the tables, but LeRobot's metadata say 9"),
         ("size", r"has frames of shape \(40, 48, 3\), but info\.json declares \(64, 64, 3\)"),
         ("action", r"features: action: is missing, but there are action\.arm"),

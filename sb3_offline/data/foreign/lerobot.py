@@ -11,11 +11,11 @@ from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.foreign.base import Foreign, Format, Options
-from sb3_offline.data.foreign.episodes import checked_observations, cut_episodes, guess_action_space, guess_observation_space
+from sb3_offline.data.foreign.episodes import cut_episodes, guess_action_space, guess_observation_space
 from sb3_offline.data.foreign.lerobot_images import Clip, DecodedImages, VideoDecoder, decode_encoded, warn_if_large
 from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.format import Header
-from sb3_offline.data.spaces import subspaces
+from sb3_offline.data.spaces import check_observations, subspaces
 
 INFO = "meta/info.json"
 METADATA = ("info.json", "episodes.jsonl", "episodes", "tasks.jsonl", "tasks.parquet")
@@ -178,6 +178,9 @@ def _read_tables(probe: Probe) -> Table:
 
     try:
         whole = pa.concat_tables(tables, promote_options="permissive")
+        for name in ("episode_index", "frame_index"):
+            if name in whole.column_names and whole[name].null_count:
+                raise DatasetError(root / "data", name, "is missing in some of LeRobot's tables", DOWNLOAD)
         owners = whole["episode_index"].to_numpy()
     except (pa.ArrowException, KeyError) as error:
         raise DatasetError(root, "data", f"are no tables of one LeRobot dataset ({error})", DOWNLOAD) from error
@@ -210,7 +213,7 @@ def _episodes(root: Path, version: str) -> list[dict[str, Any]]:
             raise DatasetError(folder, "episodes", "are missing from this LeRobot dataset", DOWNLOAD)
         episodes = [row for path in paths for row in _read_parquet(path, None).to_pylist()]
     for episode in episodes:
-        if not isinstance(episode.get("episode_index"), int):
+        if not isinstance(episode, dict) or not isinstance(episode.get("episode_index"), int):
             raise DatasetError(root / "meta", "episode_index", "is missing from the metadata of an episode", DOWNLOAD)
     return sorted(episodes, key=lambda episode: episode["episode_index"])
 
@@ -442,8 +445,7 @@ def _observations(
         name = f"observations/{key}" if key else "observations"
         declared = parts[name]
         if key in vectors:
-            arrays |= checked_observations({"observations": vectors[key][rows]}, declared, table.root)
-            arrays[name] = arrays.pop("observations") if key else arrays["observations"]
+            arrays |= check_observations(vectors[key][rows], declared, None, table.root, name)
             continue
         if tuple(declared.shape or ()) != shapes[key] or declared.dtype != np.uint8:
             problem = f"holds images of shape {shapes[key]} and dtype uint8, but the observation space declares {declared}"
