@@ -10,6 +10,8 @@ import numpy as np
 
 from sb3_offline.data.errors import DatasetError
 
+CONVERT = 'sb3-offline convert {path} data.h5, or sb3_offline.data.convert.convert(dataset, "data.h5")'
+
 
 class Clip(NamedTuple):
     """
@@ -32,11 +34,13 @@ class DecodedImages:
     :param rows: (n,) rows of the table that the images belong to
     :param shape: (height, width, channels)
     :param decode: gives the images, ``(len(rows), *shape)`` uint8, of rows of the table
-    :param place: path of the dataset, for messages
+    :param path: of the dataset, for messages
     """
 
-    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], decode: Callable[[np.ndarray], np.ndarray], place: Path):
-        self._rows, self._decode, self._place = rows, decode, place
+    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], decode: Callable[[np.ndarray], np.ndarray], path: Path):
+        self._rows, self._decode = rows, decode
+        #: the way to a file that can be memory-mapped, for messages
+        self.mapping_remedy = f"Decode them once into a file that is memory-mapped: {CONVERT.format(path=path)}"
         self.shape, self.dtype = (len(rows), *shape), np.dtype(np.uint8)
 
     def __len__(self) -> int:
@@ -54,13 +58,11 @@ class DecodedImages:
 
     def take(self, rows: np.ndarray, axis: int = 0) -> np.ndarray:
         """
-        Learners that keep their data on disk sample batches through this method.
-
-        :raises DatasetError: always, since decoding videos for each batch would take hundreds of times as long as learning
+        :param rows: (B,) indices of rows
+        :param axis: must be 0
+        :return: the images of these rows
         """
-        problem = "are encoded, and too large to be decoded into memory"
-        remedy = f"Decode them once into a file that is memory-mapped: sb3-offline convert {self._place} data.h5"
-        raise DatasetError(self._place, "images", problem, remedy)
+        return self[rows]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return self[:].astype(dtype or self.dtype, copy=False)
@@ -206,5 +208,5 @@ def warn_if_large(n_bytes: int, path: Path, limit: int = 1 << 30) -> None:
     if n_bytes > limit:
         warnings.warn(
             f"{path}: images: take {n_bytes / 2**30:.1f} GiB when they are decoded, and are decoded anew each time that the "
-            f"dataset is opened to learn from. Decode them once: sb3-offline convert {path} data.h5"
+            f"dataset is opened to learn from. Decode them once: {CONVERT.format(path=path)}."
         )
