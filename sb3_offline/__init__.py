@@ -12,6 +12,8 @@ from sb3_offline.ceborl import CEBORL as CEBORL
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm as OfflineAlgorithm
 from sb3_offline.common.registry import algorithms_in
 from sb3_offline.cql import CQL as CQL
+from sb3_offline.data.reader import OfflineDataset as OfflineDataset
+from sb3_offline.data.writer import DatasetWriter as DatasetWriter
 from sb3_offline.dcql import DCQL as DCQL
 from sb3_offline.iql import IQL as IQL
 from sb3_offline.oril import ORIL as ORIL

@@ -13,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import utils
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
@@ -28,7 +28,7 @@ from sb3_offline.common.search import LEARNING, SearchSpace
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource, OfflineDataset
+from sb3_offline.data.reader import DatasetSource
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
 
@@ -44,7 +44,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     :param env: The environment the policy is meant for: an env, a vectorized env, a registered id, or ``None``, which takes
         the spaces from the dataset. It is used for its spaces only (and, where it is a ``VecNormalize``, its observation
         statistics are fitted to the dataset).
-    :param dataset: Path of an HDF5 dataset, a glob pattern, a list of paths, or an open dataset
+    :param dataset: Path of a dataset, a glob pattern, an ``OfflineDataset``, data in memory (SB3's ``ReplayBuffer``, a
+        ``MinariDataset``, a dict of arrays with D4RL's names, a list of trajectory dicts), or a list of these. Paths are saved
+        with the model; data in memory are not
     :param learning_rate: learning rate for the optimizers, a float or a function of the remaining progress (from 1 to 0)
     :param batch_size: Transitions in a batch
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
@@ -389,11 +391,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         return total_timesteps, self._init_callback(callback, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        if progress_bar:
-            if not isinstance(callback, list):
-                callback = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-            callback = [*callback, _GradientStepBar()]
-        return super()._init_callback(callback)
+        callback = super()._init_callback(callback, progress_bar)
+        _count_gradient_steps(callback)
+        return callback
 
     def _on_step(self) -> None:
         """Called after each gradient step, before the callbacks."""
@@ -464,17 +464,34 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [*super()._excluded_save_params(), "actor", "_data", "_metrics"]
-        # `load` would open a saved dataset again, even to predict. Paths are kept, so that a loaded model can go on learning.
+        # Paths are kept, so that a loaded model can go on learning. Data in memory would be copied into the file.
         parts = self.dataset if isinstance(self.dataset, list | tuple) else [self.dataset]
-        return [*excluded, "dataset"] if any(isinstance(part, OfflineDataset) for part in parts) else excluded
+        only_paths = all(part is None or isinstance(part, str | PathLike) for part in parts)
+        return excluded if only_paths else [*excluded, "dataset"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer"], []
 
 
-class _GradientStepBar(ProgressBarCallback):
-    """SB3's bar advances by the number of environments; here a step is one gradient step."""
+def _count_gradient_steps(callback: BaseCallback, seen: set[int] | None = None) -> None:
+    """
+    Make SB3's progress bars show the timesteps of the model. SB3 adds the number of environments to a bar at each step, but a
+    timestep here is one gradient step, whatever the number of environments.
 
-    def _on_step(self) -> bool:
-        self.pbar.update(1)
-        return True
+    :param callback: a progress bar, or a callback that may contain some
+    :param seen: identities of the callbacks that need no second visit
+    """
+    seen = set() if seen is None else seen
+    seen.add(id(callback))
+    if type(callback)._on_step is ProgressBarCallback._on_step:
+        bar: Any = callback
+
+        def on_step() -> bool:
+            bar.pbar.update(bar.model.num_timesteps - bar.model._num_timesteps_at_start - bar.pbar.n)
+            return True
+
+        bar._on_step = on_step
+    for value in vars(callback).values():
+        for inner in value if isinstance(value, list) else [value]:
+            if isinstance(inner, BaseCallback) and id(inner) not in seen:
+                _count_gradient_steps(inner, seen)

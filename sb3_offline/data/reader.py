@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set, ValuesView
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ class OfflineDataset:
     """
     A dataset file of format version 1, or data of another library: D4RL-style HDF5 files or dicts, Minari datasets
     (``minari:namespace/name-v0``, or the folder), replay buffers of Stable-Baselines3 (in memory or pickled; open only pickles
-    that you trust), and rollouts of `imitation` (``.npz``, or a folder). The format is recognised by the contents. Opening
+    that you trust), rollouts of `imitation` (``.npz``, or a folder), folders of LeRobot, files of d3rlpy, and lists of
+    trajectory dicts (in memory or pickled). The format is recognised by the contents. Opening
     checks the data and raises ``DatasetError``, which names the file, the field and the remedy.
 
     Arrays are flat over all steps. Episode e has its steps at ``step_starts[e] + arange(lengths[e])``, and its observations,
@@ -202,7 +203,7 @@ def _open_each(dataset: Any) -> Iterator[OfflineDataset]:
         if not paths and glob.has_magic(pattern):
             raise DatasetError(pattern, "dataset", "matches no file", "Check the pattern")
         yield from (OfflineDataset(path) for path in paths or [pattern])
-    elif isinstance(dataset, Iterable) and not isinstance(dataset, Mapping) and recognize(Probe(dataset)) is None:
+    elif isinstance(dataset, Sequence | Set | ValuesView | Iterator) and recognize(Probe(dataset)) is None:
         for part in dataset:
             yield from _open_each(part)
     else:

@@ -83,6 +83,10 @@ def observation_stores(
                 problem = "is compressed and cannot be memory-mapped"
                 remedy = "Convert it to contiguous storage (sb3-offline convert), or use storage='memory' if it fits"
                 raise DatasetError(dataset.path, "observations", problem, remedy)
+            for name in names:  # decoding videos for each batch would take far longer than learning
+                if mapping_remedy := getattr(dataset.arrays[name], "mapping_remedy", ""):
+                    problem = "are encoded, and too large to be decoded into memory, or memory-mapping was asked for"
+                    raise DatasetError(dataset.path, name, problem, mapping_remedy)
         return {name: RowStore(column) for name, column in columns.items()}, "mmap"
     return {name: RowStore([_read_all(column)]) for name, column in columns.items()}, "memory"
 

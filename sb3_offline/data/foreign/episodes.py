@@ -118,11 +118,14 @@ def guess_observation_space(observations: np.ndarray) -> spaces.Box:
     return spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
 
 
-def guess_action_space(actions: np.ndarray, path: str | os.PathLike, format_name: str = "") -> spaces.Box:
+def guess_action_space(
+    actions: np.ndarray, path: str | os.PathLike, format_name: str = "", name: str = "actions"
+) -> spaces.Box:
     """
     :param actions: (n, ...) actions without a declared space
     :param path: file for error messages
     :param format_name: name of the format for error messages
+    :param name: name of the actions in the file, for error messages
     :return: a Box of their shape with the bounds [-1, 1]
     :raises DatasetError: if the actions are integers, or if they exceed these bounds
     """
@@ -130,8 +133,8 @@ def guess_action_space(actions: np.ndarray, path: str | os.PathLike, format_name
     data = f"data of {format_name}" if format_name else "data of this format"
     if actions.dtype.kind != "f":
         problem = f"has dtype {actions.dtype}, and {data} do not declare which actions there are"
-        raise DatasetError(path, "actions", problem, remedy)
+        raise DatasetError(path, name, problem, remedy)
     if actions.size and np.abs(actions).max() > 1 + 1e-5:
         problem = f"reaches from {actions.min():.4g} to {actions.max():.4g}, and {data} declare no bounds"
-        raise DatasetError(path, "actions", problem, remedy)
+        raise DatasetError(path, name, problem, remedy)
     return spaces.Box(-1.0, 1.0, actions.shape[1:], np.float32)

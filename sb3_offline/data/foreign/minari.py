@@ -27,6 +27,7 @@ from sb3_offline.data.format import Header
 from sb3_offline.data.spaces import check_rows, space_to_json, subspaces
 
 PREFIX = "minari:"
+DATASET_CLASS = "minari.dataset.minari_dataset.MinariDataset"
 # Metadata that each dataset has of its own: a copy does not take them over.
 OF_THE_COPY = {
     "dataset_id",
@@ -64,8 +65,10 @@ def dataset_folder(name: str) -> Path:
 def recognizes(probe: Probe) -> bool:
     """
     :param probe: a path or an object
-    :return: whether it is the folder of a Minari dataset, the folder ``data`` inside of it, or the HDF5 file in that
+    :return: whether it is a ``MinariDataset``, the folder of one, the folder ``data`` inside of it, or the HDF5 file in that
     """
+    if probe.is_object:  # told by name, so that minari is not imported for other objects
+        return any(f"{cls.__module__}.{cls.__name__}" == DATASET_CLASS for cls in type(probe.given).__mro__)
     return _data_folder(probe) is not None
 
 
@@ -84,7 +87,7 @@ def read(probe: Probe, options: Options) -> Foreign:
     """
     Read a Minari dataset into memory.
 
-    :param probe: the folder
+    :param probe: the folder, or the ``MinariDataset``, of which only the chosen episodes are read
     :param options: none is needed, since Minari declares all of them
     :return: the data
     """
@@ -93,7 +96,8 @@ def read(probe: Probe, options: Options) -> Foreign:
     path, folder = probe.path, _data_folder(probe) or probe.path
     probe.close()
     try:
-        dataset = MinariDataset(folder)
+        dataset = probe.given if probe.is_object else MinariDataset(folder)
+        folder = Path(dataset.storage.data_path)
         metadata = dataset.storage.read_raw_metadata(folder)
         ids = [int(index) for index in dataset.episode_indices]
         episodes = list(dataset.storage.get_episodes(ids))
@@ -321,7 +325,7 @@ def _episodes(header: Header, arrays: Mapping[str, Any]) -> Iterator[Any]:
 
 FORMAT = Format(
     name="Minari",
-    description=f"{PREFIX}namespace/name-v0, or a folder with data/metadata.json",
+    description=f"{PREFIX}namespace/name-v0, a folder with data/metadata.json, or a MinariDataset",
     recognizes=recognizes,
     read=read,
     declares_spaces=True,

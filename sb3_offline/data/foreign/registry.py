@@ -85,6 +85,12 @@ def unknown_format(probe: Probe) -> DatasetError:
         remedy = f"Give a file or a pattern of files (folder/*.h5), or a folder of a known format. {remedy}"
     elif promised := probe.promised_kind():
         remedy = f"Check that the file is complete, since its name promises a {promised} file. {remedy}"
+    elif probe.is_object:
+        remedy = (
+            "Give a path, an OfflineDataset, a ReplayBuffer of SB3, a MinariDataset, a dict of arrays with D4RL's names, a "
+            "list of trajectory dicts, or a list of paths; or write the data to a file with sb3_offline.DatasetWriter. "
+            f"{remedy}"
+        )
     field = probe.kind if probe.kind in ("object", "folder") else "file"
     return DatasetError(probe.path, field, f"has no known format: it is {probe.describe()}", remedy)
 
