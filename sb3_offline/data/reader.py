@@ -17,6 +17,7 @@ from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.foreign.registry import find_path, read_foreign, recognize, unknown_format
 from sb3_offline.data.format import Header, Storage
 from sb3_offline.data.native import is_native, read_native
+from sb3_offline.data.plain import check_all_plain
 
 
 class OfflineDataset:
@@ -91,6 +92,8 @@ class OfflineDataset:
             self._declares_spaces = True
             header, native_arrays, self.storage = read_native(probe.hdf5, probe.path)
             return header, native_arrays
+        if probe.hdf5 is not None:
+            check_all_plain(probe.hdf5, probe.path)
         known = recognize(probe)
         if known is None:
             raise unknown_format(probe)
