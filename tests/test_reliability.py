@@ -327,6 +327,14 @@ def test_a_model_runs_no_code_without_consent(finished_run, tmp_path):
         main(["evaluate", str(tmp_path / "run" / MODEL_FILE)])
 
 
+def test_training_does_not_write_over_its_data(finished_run, tmp_path):
+    os.link(finished_run / "d.h5", tmp_path / "evaluations.csv")
+    before = (finished_run / "d.h5").read_bytes()
+    with pytest.raises(SystemExit, match=r"evaluations.csv: file: is read by this very command"):
+        main(["train", "--algo", "bc", "--dataset", str(finished_run / "*.h5"), "-n", "2", "-o", str(tmp_path)])
+    assert (finished_run / "d.h5").read_bytes() == before and os.listdir(tmp_path) == ["evaluations.csv"]
+
+
 # --- Training over a finished run ---
 
 
