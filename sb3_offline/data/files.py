@@ -150,7 +150,7 @@ def check_outputs(outputs: Iterable[str | os.PathLike], inputs: Iterable[Any]) -
     existing = [Path(output).expanduser() for output in outputs if os.path.exists(os.path.expanduser(output))]
     if not existing:
         return
-    read = {}
+    read: dict[tuple[int, int], Any] = {}
     for given in inputs:
         if isinstance(given, str | os.PathLike):
             place = os.path.expanduser(given)

@@ -38,7 +38,7 @@ for _core in ("numpy.core", "numpy._core"):
     _CALLABLES[f"{_core}.multiarray"] = {"_reconstruct", "scalar"}
     _CALLABLES[f"{_core}.numeric"] = {"_frombuffer"}
 # Modules whose classes of the kinds below hold values, and run nothing when they are created.
-_MODULES = ("sb3_offline.", "stable_baselines3.", "gymnasium.spaces.", "torch.nn.modules.", "torch.optim.")
+_MODULES = ("sb3_offline.", "stable_baselines3.", "sb3_contrib.", "gymnasium.spaces.", "torch.nn.modules.", "torch.optim.")
 _KINDS = (
     spaces.Space,
     th.nn.Module,
@@ -51,6 +51,10 @@ _KINDS = (
     enum.Enum,
     tuple,
 )
+
+
+class _RefusedError(Exception):
+    """A pickle calls something that is not known to be harmless."""
 
 
 class _Checker(pickle.Unpickler):
@@ -71,7 +75,7 @@ class _Checker(pickle.Unpickler):
                 harmless = isinstance(found, type) and issubclass(found, _KINDS)
             if harmless:
                 return found
-        raise pickle.UnpicklingError(f"it calls {module}.{name}")
+        raise _RefusedError(f"it calls {module}.{name}")
 
 
 def _load_tensor(data: bytes) -> Any:
@@ -86,13 +90,16 @@ def check_pickle(file: IO[bytes], path: Path, field: str, remedy: str) -> None:
     :param path: its file, for the error message
     :param field: the part of the file, for the error message
     :param remedy: how to give consent, for the error message
-    :raises DatasetError: if it may run other code
+    :raises DatasetError: if it may run other code, or if it is damaged
     """
     try:
         _Checker(file).load()
-    except Exception as error:  # damaged pickles raise errors of any type
-        problem = f"is a pickle, which may run any code when it is opened ({' '.join(str(error).split())})"
+    except _RefusedError as error:
+        problem = f"is a pickle, which may run any code when it is opened ({error})"
         raise DatasetError(path, field, problem, remedy) from error
+    except Exception as error:  # damaged pickles raise errors of any type
+        problem = f"cannot be unpickled ({' '.join(str(error).split())})"
+        raise DatasetError(path, field, problem, "Save it again, with the packages that read it") from error
 
 
 def check_model(path: Path, remedy: str) -> None:
