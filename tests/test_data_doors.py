@@ -389,13 +389,16 @@ def test_replay_buffers_in_memory_and_of_old_versions(tmp_path):
 
 def test_pickles_without_a_replay_buffer_are_refused(tmp_path):
     whole = pickle.dumps(Fraction(1, 2))
-    for name, content, message in (
-        ("a.pkl", whole, "is a fractions.Fraction, not a ReplayBuffer"),
-        ("b.pkl", whole[:-10], "file: cannot be unpickled"),
+    damaged = "file: cannot be unpickled"
+    for name, content, untrusted, message in (
+        ("a.pkl", whole, r"may run any code .*it calls fractions.Fraction", "is a fractions.Fraction, not a ReplayBuffer"),
+        ("b.pkl", whole[:-10], f"{damaged}|may run any code", damaged),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(DatasetError, match=message):
+        with pytest.raises(DatasetError, match=untrusted):
             OfflineDataset(tmp_path / name)
+        with pytest.raises(DatasetError, match=message):
+            OfflineDataset(tmp_path / name, trust=True)
     with pytest.raises(DatasetError, match="does not exist"):
         OfflineDataset(tmp_path / "nowhere.pkl")
 

@@ -6,10 +6,12 @@ These are not the learned agents of the CEBORL paper, but stand in for them: abo
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import warnings
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +19,8 @@ from metaworld import policies
 from tqdm.auto import tqdm
 
 from sb3_offline.common.provenance import SIMULATION_PACKAGES, installed_versions
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import WriteLock, replacing
 from sb3_offline.data_tools.collecting.rollout import (
     TaskEpisode,
     add_episode,
@@ -167,7 +171,7 @@ def collect_scripted(
     table: str = "paper",
 ) -> dict[str, float]:
     """
-    Collect episodes and write them to one dataset file.
+    Collect episodes and write them to one dataset file, which appears when all of them are collected.
 
     A step's `success` is success at the attempted task, which is the episode's `source`. The file holds no `rewards`, since it
     would mix those of several tasks. Its extras are `task_success`, `task_reward`, `state` and `scene_state` of `TaskEpisode`.
@@ -185,6 +189,8 @@ def collect_scripted(
     """
     tasks = find_table(table).tasks if tasks is None else tasks
     check_tasks(tasks, table)
+    if episodes_per_task < 1:
+        raise ValueError(f"episodes_per_task is {episodes_per_task}; give at least 1")
     n_episodes = episodes_per_task * len(tasks)
     solved = dict.fromkeys(tasks, 0)
     provenance = {
@@ -194,7 +200,12 @@ def collect_scripted(
         "episodes_per_task": episodes_per_task,
         "versions": installed_versions(SIMULATION_PACKAGES),
     }
-    with episode_writer(path, obs_type, tasks, n_episodes, provenance, mode, table) as writer:
+    path = Path(path).expanduser()
+    with WriteLock(path) as lock, contextlib.ExitStack() as stack:
+        if path.exists() and mode == "x":
+            raise DatasetError(path, "file", "exists already", 'Name another file, or replace it with mode="w" (--overwrite)')
+        temporary = stack.enter_context(replacing(path, lock))  # a collection that fails or is killed leaves nothing
+        writer = stack.enter_context(episode_writer(temporary, obs_type, tasks, n_episodes, provenance, "x", table))
         episodes = scripted_episodes(
             episodes_per_task, tasks=tasks, obs_type=obs_type, seed=seed, n_workers=n_workers, table=table
         )

@@ -16,11 +16,12 @@ class JoinedDatasets:
     same shape, and ``left_out`` names the others.
 
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these
+    :param trust: open pickles that may run any code
     :raises DatasetError: if the files are not of one environment
     """
 
-    def __init__(self, dataset: DatasetSource):
-        self.parts = open_datasets(dataset)
+    def __init__(self, dataset: DatasetSource, *, trust: bool = False):
+        self.parts = open_datasets(dataset, trust=trust)
         first = self.parts[0]
         self.observation_space, self.action_space = first.observation_space, first.action_space
         self.env_id, self.env_kwargs = first.env_id, first.env_kwargs

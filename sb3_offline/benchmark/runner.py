@@ -51,7 +51,7 @@ def export_policies(cells: Mapping[Cell, GridRun], runs: Path, folder: Path) -> 
     """
     finished = {run.folder for run in cells.values() if run.is_finished()}
     for source in sorted(finished):
-        save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / MODEL_FILE))
+        save_policy(folder / f"{source.relative_to(runs)}.npz", *load_run(source / MODEL_FILE, trust=True))
     return len(finished)
 
 

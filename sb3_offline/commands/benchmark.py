@@ -9,6 +9,7 @@ from pathlib import Path
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import export_policies, run_grid
+from sb3_offline.data.files import check_outputs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
+    check_outputs([args.output, args.output.with_name(f"{args.output.stem}_curves.csv")], [args.grid])
     train: Callable | None = None
     if args.ray_address and not args.no_training:
         from sb3_offline.benchmark.on_ray import train_on_ray  # needs the extra ray

@@ -23,6 +23,8 @@ def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
     from sb3_offline.data_tools.collecting.scripted import collect_scripted  # needs the extra metaworld
 
+    if args.episodes_per_task < 1:
+        sys.exit(f"sb3-offline: --episodes-per-task is {args.episodes_per_task}; give a number of at least 1")
     if Path(args.output).exists() and not args.overwrite:
         sys.exit(f"sb3-offline: {args.output} exists already; name another file, or add --overwrite")
     shares = collect_scripted(

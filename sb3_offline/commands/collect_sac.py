@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+from sb3_offline.data.files import check_outputs
 from sb3_offline.data_tools import POLICIES
 from sb3_offline.data_tools.collecting.card import write_card
 from sb3_offline.data_tools.collecting.sac import (
@@ -52,6 +53,13 @@ def _shard(text: str) -> tuple[int, int]:
 
 def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
+    if args.card:
+        check_outputs([args.card], [args.output, args.policies])
+    check_outputs([args.output], [args.policies])
+    if args.examples and args.output.resolve() in [
+        (args.examples / f"{name}.h5").resolve() for name in ("held_out", *args.tasks)
+    ]:
+        sys.exit(f"sb3-offline: --examples {args.examples}: would write over {args.output}; name another folder")
     began = time.time()
     collection = Collection(
         args.episodes_per_task, tuple(args.tasks), args.obs_type, args.seed, policies=str(args.policies.resolve())

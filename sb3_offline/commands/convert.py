@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--env", help="id of the environment, for the spaces and the time limit that the source does not declare"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the destination if it is a file")
+    parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -34,6 +35,6 @@ def run(args: argparse.Namespace) -> None:
         declared = {"observation_space": env.observation_space, "action_space": env.action_space}
         declared["max_episode_steps"] = env.spec.max_episode_steps if env.spec else None
         env.close()
-    dataset = OfflineDataset(args.source, **declared)
+    dataset = OfflineDataset(args.source, **declared, trust=args.trust)
     dataset.header.env_id = dataset.header.env_id or args.env or ""
     convert(dataset, args.destination, args.storage, overwrite=args.overwrite)

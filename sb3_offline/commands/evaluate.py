@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from sb3_offline.data.files import check_outputs
 from sb3_offline.envs import lacks_task
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, evaluate_success
 from sb3_offline.experiment.policy_file import load_policy
@@ -20,13 +21,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=50, help="number of episodes (default: 50)")
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help=f"seed of the episodes (default: {EVALUATION_SEED})")
     parser.add_argument("--gif", type=Path, help="record the first episodes in this file")
+    parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
     if args.gif and args.gif.suffix.lower() != ".gif":
         sys.exit(f"sb3-offline: --gif {args.gif}: is not the name of a GIF; end it in .gif")
-    model, config = load_policy(args.model) if args.model.suffix == ".npz" else load_run(args.model)
+    if args.gif:
+        check_outputs([args.gif], [args.model])
+    model, config = load_policy(args.model) if args.model.suffix == ".npz" else load_run(args.model, trust=args.trust)
+    if ":" in str(config["env"]) and not args.trust:
+        module = str(config["env"]).rpartition(":")[0]
+        remedy = "if you trust the origin of the policy, add --trust"
+        sys.exit(f"sb3-offline: {args.model}: env: names {config['env']!r}, which runs the module {module}; {remedy}")
     if args.task:
         config["env_kwargs"]["task"] = args.task
     if lacks_task(config["env"], config["env_kwargs"]):

@@ -5,6 +5,7 @@ import os
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import save_examples
+from sb3_offline.data.files import check_outputs
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.data_tools.converting.extract_examples import extract_examples
 
@@ -18,14 +19,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
     parser.add_argument("--held-out", action="store_true", help="record that these episodes are not learned from")
     parser.add_argument("--overwrite", action="store_true", help="replace the output file")
+    parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
     if os.path.exists(args.output) and not args.overwrite:
         raise DatasetError(args.output, "file", "exists already", "Give --overwrite to replace it")
-    datasets = open_datasets(args.dataset)
+    datasets = open_datasets(args.dataset, trust=args.trust)
+    check_outputs([args.output], [dataset.path for dataset in datasets])
     examples, provenance = extract_examples(datasets, args.count, source=args.source, seed=args.seed, held_out=args.held_out)
-    save_examples(args.output, examples, datasets[0].observation_space, provenance)
+    save_examples(args.output, examples, datasets[0].observation_space, provenance, overwrite=args.overwrite)
     n_episodes = sum(len(origin["episodes"]) for origin in provenance["datasets"])
     print(f"{args.count} examples from {n_episodes} episodes -> {args.output}")

@@ -4,6 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
+from sb3_offline.data.files import check_outputs
 from sb3_offline.data_tools.inspecting.dataset_statistics import inspect_dataset
 from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
 from sb3_offline.data_tools.inspecting.page import write_page
@@ -16,11 +17,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--html", type=Path, metavar="PAGE", help="also write a page for the browser, in one file")
     parser.add_argument("--examples", help="success examples to compare with the data: folder, .npz, .npy or HDF5 file")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a text")
+    parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
 
 
 def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
-    data = JoinedDatasets(args.dataset)
+    data = JoinedDatasets(args.dataset, trust=args.trust)
+    if args.html:
+        check_outputs([args.html], [*(part.path for part in data.parts), args.examples])
     summary = inspect_dataset(data, args.examples)
     print(json.dumps(summary, indent=2) if args.json else format_summary(summary))
     if args.html:

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from sb3_offline.data.files import check_outputs
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: parser of the command"""
@@ -17,5 +19,6 @@ def run(args: argparse.Namespace) -> None:
     """:param args: values of the options"""
     from sb3_offline.report.report import write_report  # needs the extra report
 
+    check_outputs([args.output / "report.md"], [*args.tables, args.notes])
     for line in write_report(args.tables, args.output, args.runs, args.reference, args.notes):
         print(line, flush=True)

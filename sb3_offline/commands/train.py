@@ -1,13 +1,17 @@
 """The command ``sb3-offline train``."""
 
 import argparse
+import glob
+import os
 from pathlib import Path
+from typing import Any
 
 from sb3_offline import ALGOS
+from sb3_offline.data.files import check_outputs
 from sb3_offline.envs import ENV_ID
 from sb3_offline.experiment.config import load_config, parse_overrides
-from sb3_offline.experiment.run import MODEL_FILE, TrainingRun
-from sb3_offline.experiment.training import find_algorithm, train_run
+from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, TrainingRun
+from sb3_offline.experiment.training import RESUME_FILE, find_algorithm, train_run
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,5 +50,13 @@ def run(args: argparse.Namespace) -> None:
         eval_freq=args.eval_freq,
         n_eval_episodes=args.eval_episodes,
     )
+    read = [args.config, training.examples or config.get("examples"), *_files(training.dataset or config.get("dataset"))]
+    check_outputs([args.output / name for name in (MODEL_FILE, CONFIG_FILE, RESUME_FILE, "evaluations.csv")], read)
     train_run(training, verbose=1)
     print(f"Saved {args.output / MODEL_FILE}")
+
+
+def _files(dataset: Any) -> list[str]:
+    """:return: the files that paths and patterns of datasets stand for"""
+    patterns = [dataset] if isinstance(dataset, str) else dataset if isinstance(dataset, list) else []
+    return [file for pattern in patterns for file in [str(pattern), *glob.glob(os.path.expanduser(str(pattern)))]]

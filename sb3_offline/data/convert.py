@@ -1,5 +1,6 @@
 """Conversion of datasets: to contiguous storage (for training), to compressed storage (for keeping and sending), to Minari."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import h5py
 from tqdm.auto import tqdm
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.files import replacing
+from sb3_offline.data.files import WriteLock, check_outputs, replacing
 from sb3_offline.data.foreign.registry import format_of_name, write_foreign
 from sb3_offline.data.format import CHUNK_BYTES, Storage, create_file
 from sb3_offline.data.reader import OfflineDataset
@@ -28,12 +29,13 @@ def convert(
     or not at all.
 
     :param dataset: anything that :class:`~sb3_offline.data.reader.OfflineDataset` opens
-    :param destination: file to write, which may be that of the dataset if ``overwrite`` is true; or a name such as
-        "minari:namespace/name-v0" for a new Minari dataset
+    :param destination: file to write; or a name such as "minari:namespace/name-v0" for a new Minari dataset. A dataset of our
+        own format may be converted in its place, if ``overwrite`` is true
     :param storage: "contiguous" or "compressed" (gzip), for a file
     :param overwrite: replace an existing file
     :param progress_bar: show the progress
-    :raises DatasetError: if the dataset cannot be opened, or if the destination exists and ``overwrite`` is false
+    :raises DatasetError: if the dataset cannot be opened, if the destination exists and ``overwrite`` is false, if it is a
+        file of a dataset of another library, or if another process writes it
     """
     opened = dataset if isinstance(dataset, OfflineDataset) else OfflineDataset(dataset)
     foreign = format_of_name(os.fspath(destination))
@@ -41,11 +43,16 @@ def convert(
         write_foreign(foreign, opened.header, opened.arrays, os.fspath(destination))
         return
     path = Path(destination).expanduser()
-    if path.exists() and not overwrite:
-        raise DatasetError(path, "file", "exists already", "Give another name, or overwrite it (--overwrite)")
     fields = opened.header.fields()
     total = sum(spec.rows(opened.n_episodes, opened.n_steps) * spec.row_bytes for spec in fields.values())
-    with replacing(path) as temporary, tqdm(total=total, unit="B", unit_scale=True, disable=not progress_bar) as bar:
+    # Other writers of the destination are refused at once instead of doing all the work for nothing
+    with WriteLock(path) as lock, contextlib.ExitStack() as stack:
+        if path.exists() and not overwrite:
+            raise DatasetError(path, "file", "exists already", "Give another name, or overwrite it (--overwrite)")
+        if opened.storage == "memory":
+            check_outputs([path], [opened.path])
+        temporary = stack.enter_context(replacing(path, lock))
+        bar = stack.enter_context(tqdm(total=total, unit="B", unit_scale=True, disable=not progress_bar))
         bar.set_description(f"{opened.path.name} -> {storage}")
         create_file(temporary, opened.header, opened.n_episodes, opened.n_steps, committed=opened.n_episodes, storage=storage)
         with h5py.File(temporary, "r+", locking=False) as file:

@@ -22,4 +22,6 @@ class DatasetError(RuntimeError):
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.file else self.field
-        return f"{place}: {self.problem}. {self.remedy}."
+        text = " ".join(f"{place}: {self.problem}. {self.remedy}.".splitlines())
+        # The words of a file reach the terminal here: control characters in them must not
+        return "".join(character if character.isprintable() else f"\\x{ord(character):02x}" for character in text)

@@ -12,7 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.files import open_hdf5, replacing
+from sb3_offline.data.files import WriteLock, open_hdf5, replacing
+from sb3_offline.data.plain import check_all_plain, check_stored, is_text, read_attribute
 from sb3_offline.data.spaces import check_observations, space_to_json, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
@@ -77,6 +78,8 @@ def save_examples(
     observations: np.ndarray | Mapping[str, np.ndarray],
     observation_space: spaces.Space,
     provenance: Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = True,
 ) -> None:
     """
     Write success examples to an HDF5 file. An existing file is replaced in one step.
@@ -85,11 +88,23 @@ def save_examples(
     :param observations: ``(n, *shape)``, or a dict of such arrays for a Dict space
     :param observation_space: space of one observation
     :param provenance: origin of the examples (JSON)
-    :raises DatasetError: if the observations do not fit the space
+    :param overwrite: replace an existing file
+    :raises DatasetError: if the observations do not fit the space, if the file exists and ``overwrite`` is false, or if
+        another process writes it
     """
     path = Path(path).expanduser()
     arrays = check_observations(observations, observation_space, None, path)
-    with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
+    with WriteLock(path) as lock:
+        if path.exists() and not overwrite:
+            raise DatasetError(path, "file", "exists already", "Give --overwrite to replace it")
+        with replacing(path, lock) as temporary:
+            _write(temporary, arrays, observation_space, provenance)
+
+
+def _write(
+    path: Path, arrays: Mapping[str, np.ndarray], observation_space: spaces.Space, provenance: Mapping[str, Any] | None
+) -> None:
+    with h5py.File(path, "w", locking=False) as file:
         file.attrs["format"] = EXAMPLES_FORMAT
         file.attrs["format_version"] = EXAMPLES_VERSION
         file.attrs["observation_space"] = space_to_json(observation_space)
@@ -100,14 +115,34 @@ def save_examples(
 
 def _read_hdf5(path: Path) -> Observations:
     with open_hdf5(path) as file:
-        if file.attrs.get("format") != EXAMPLES_FORMAT or file.attrs.get("format_version") != EXAMPLES_VERSION:
-            found = f"is {file.attrs.get('format')!r} version {file.attrs.get('format_version')}"
+        found, version = (read_attribute(file, name) for name in ("format", "format_version"))
+        if not is_text(found, EXAMPLES_FORMAT) or not isinstance(version, np.integer) or version != EXAMPLES_VERSION:
+            problem = f"is {found!r} version {version}, expected {EXAMPLES_FORMAT!r} {EXAMPLES_VERSION}"
             remedy = "Extract examples from a dataset first (sb3-offline examples), or give .npz, .npy or a folder of images"
-            raise DatasetError(path, "attribute format", f"{found}, expected {EXAMPLES_FORMAT!r} {EXAMPLES_VERSION}", remedy)
-        node = file.get("observations")
-        if node is None:
-            raise DatasetError(path, "observations", "is missing", "Write the file again with save_examples")
-        return node[()] if isinstance(node, h5py.Dataset) else {key: array[()] for key, array in node.items()}
+            raise DatasetError(path, "attribute format", problem, remedy)
+        try:
+            check_all_plain(file, path)
+            node = file.get("observations")
+            if node is None:
+                raise DatasetError(path, "observations", "is missing", "Write the file again with save_examples")
+            if isinstance(node, h5py.Dataset):
+                return _read_array(node, path)
+            return {key: _read_array(array, path) for key, array in node.items()}
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
+            if isinstance(error, DatasetError):
+                raise
+            problem = f"cannot be read ({' '.join(str(error).split())})"
+            raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+
+
+def _read_array(array: Any, path: Path) -> np.ndarray:
+    if not isinstance(array, h5py.Dataset) or not array.shape or array.dtype.kind not in "biuf":
+        problem = "is not an array of numbers with a row for each example"
+        raise DatasetError(path, array.name.lstrip("/"), problem, "Write the file again with save_examples")
+    size = os.fstat(array.file.id.get_vfd_handle()).st_size
+    row_bytes = int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
+    check_stored(array, array.shape[0], row_bytes, size, path)
+    return array[()]
 
 
 def _read_numpy(path: Path, space: spaces.Space) -> Observations:

@@ -6,8 +6,9 @@ observations than it has steps, so that no observation is stored twice.
 """
 
 import json
+import operator
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -17,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.plain import check_plain, is_text, read_attribute
 from sb3_offline.data.spaces import space_from_json, space_to_json, subspaces
 
 FORMAT = "sb3-offline-dataset"
@@ -24,6 +26,10 @@ FORMAT_VERSION = 1
 # Size of a chunk in compressed storage. These are 50 frames of 64x64x3: gzip finds the previous frames in its window, and a
 # chunk fits into HDF5's default chunk cache of 1 MiB.
 CHUNK_BYTES = 50 * 64 * 64 * 3
+
+# Kinds of dtypes of extras: flags, numbers, and texts of a fixed length. Others, such as references, records and texts of
+# variable length, would point to other places in the file.
+EXTRA_KINDS = "biufS"
 
 Storage = Literal["contiguous", "compressed"]
 
@@ -98,7 +104,7 @@ class Header:
         for name in ("terminated", "truncated") + (("success",) if self.success else ()):
             fields[name] = Field("step", (), np.dtype(bool))
         for name, (shape, dtype) in self.extras.items():
-            fields[f"extras/{name}"] = Field("step", tuple(shape), np.dtype(dtype))
+            fields[f"extras/{name}"] = _extra_field(name, shape, dtype)
         return fields
 
     def attributes(self) -> dict[str, Any]:
@@ -115,6 +121,21 @@ class Header:
         return attributes if self.sources is None else {**attributes, "sources": json.dumps(self.sources)}
 
 
+def _extra_field(name: str, shape: Any, dtype: Any) -> Field:
+    """:return: the field of an extra; raises ``DatasetError`` if a file cannot hold it as a plain array"""
+    field = f"extras/{name}"
+    if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or "\0" in name:
+        raise DatasetError("", field, "is no name of an array", "Give a name without a slash")
+    try:
+        spec = Field("step", tuple(operator.index(size) for size in shape), np.dtype(dtype))
+    except TypeError as error:
+        raise DatasetError("", field, f"is declared as {(shape, dtype)!r}", "Give (shape of one row, dtype)") from error
+    if spec.dtype.kind not in EXTRA_KINDS or spec.dtype.itemsize == 0 or min(spec.shape, default=0) < 0:
+        problem = f"has rows of shape {spec.shape} and dtype {spec.dtype}"
+        raise DatasetError("", field, problem, "Use numbers, flags, or texts of a fixed length ('S10')")
+    return spec
+
+
 def read_header(file: h5py.File, path: str | os.PathLike) -> Header:
     """
     :param file: an open file of this format
@@ -122,36 +143,71 @@ def read_header(file: h5py.File, path: str | os.PathLike) -> Header:
     :return: its header
     :raises DatasetError: if the format is another one, the version is newer, or an attribute cannot be read
     """
-    if file.attrs.get("format") != FORMAT:
-        problem = f"is {file.attrs.get('format')!r}, expected {FORMAT!r}"
+    found = read_attribute(file, "format")
+    if not is_text(found, FORMAT):
+        problem = f"is {found!r}, expected {FORMAT!r}"
         remedy = "Give a dataset written by DatasetWriter, or convert the file first (sb3-offline convert)"
         raise DatasetError(path, "attribute format", problem, remedy)
-    version = file.attrs.get("format_version")
-    if version != FORMAT_VERSION:
-        remedy = (
-            "Update sb3-offline" if isinstance(version, np.integer) and version > FORMAT_VERSION else "Convert the file again"
-        )
+    version = read_attribute(file, "format_version")
+    is_number = isinstance(version, np.integer)
+    if not is_number or version != FORMAT_VERSION:
+        remedy = "Update sb3-offline" if is_number and version > FORMAT_VERSION else "Convert the file again"
         raise DatasetError(path, "attribute format_version", f"is {version}, this release reads {FORMAT_VERSION}", remedy)
 
-    def attribute(name: str, decode: Any) -> Any:
+    def attribute(name: str, decode: Callable[[str], Any]) -> Any:
         try:
-            return decode(file.attrs[name])
-        except (KeyError, TypeError, ValueError) as error:
+            value = file.attrs[name]
+            if not isinstance(value, str):
+                raise TypeError(f"it is of type {type(value).__name__}, not a text")
+            return decode(value)
+        except Exception as error:  # spaces check their arguments in several ways
             problem = "is missing" if name not in file.attrs else f"cannot be understood ({error})"
             raise DatasetError(path, f"attribute {name}", problem, "Write the file again with DatasetWriter") from error
 
+    check_plain(file, path, ["extras"])
     extras = file.get("extras", {})
-    return Header(
+    if not isinstance(extras, h5py.Group | dict):
+        raise DatasetError(path, "extras", "is an array, not a group of arrays", "Write the file again with DatasetWriter")
+    declared = {}
+    for name in extras:
+        check_plain(file, path, [f"extras/{name}"])
+        array = extras[name]
+        if not isinstance(array, h5py.Dataset) or array.shape is None:
+            problem = "is not an array with rows"
+            raise DatasetError(path, f"extras/{name}", problem, "Write the file again with DatasetWriter")
+        declared[name] = (array.shape[1:], array.dtype)
+    header = Header(
         observation_space=attribute("observation_space", space_from_json),
         action_space=attribute("action_space", space_from_json),
         env_id=attribute("env_id", str),
-        env_kwargs=attribute("env_kwargs", json.loads),
-        provenance=attribute("provenance", json.loads),
-        sources=attribute("sources", json.loads) if "sources" in file.attrs else None,
+        env_kwargs=attribute("env_kwargs", _decode_dict),
+        provenance=attribute("provenance", _decode_dict),
+        sources=attribute("sources", _decode_texts) if "sources" in file.attrs else None,
         rewards="rewards" in file,
         success="success" in file,
-        extras={name: (array.shape[1:], array.dtype) for name, array in extras.items()},
+        extras=declared,
     )
+    try:
+        header.fields()
+    except DatasetError as error:
+        raise DatasetError(path, error.field, error.problem, "Write the file again with DatasetWriter") from error
+    return header
+
+
+def _decode_dict(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise TypeError(f"it is a JSON {type(value).__name__}, not an object")
+    return value
+
+
+def _decode_texts(text: str) -> list[str]:
+    value = json.loads(text)
+    if not isinstance(value, list) or not all(isinstance(label, str) for label in value):
+        raise TypeError("it is not a JSON list of texts")
+    if len(set(value)) < len(value):
+        raise ValueError("it holds a label twice")
+    return value
 
 
 def create_file(

@@ -1,13 +1,16 @@
 """Reading files of our own format: the structure is checked, small arrays are read, large ones stay in the file."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
 import h5py
+import numpy as np
 
 from sb3_offline.data.arrays import ArrayLike, HDF5Array, MappedArray, MappedFile
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.format import FORMAT, Header, Storage, read_header
+from sb3_offline.data.plain import check_plain, check_stored, is_text, read_attribute
 
 # Observations and extras may be as large as the disk, so they are left there.
 LEFT_IN_THE_FILE = ("observations", "extras/")
@@ -32,7 +35,7 @@ def is_native(file: h5py.File) -> bool:
     :param file: an open HDF5 file
     :return: whether it says that it is of our own format
     """
-    return bool(file.attrs.get("format") == FORMAT)
+    return is_text(read_attribute(file, "format"), FORMAT)
 
 
 def read_native(file: h5py.File, path: Path) -> Native:
@@ -44,12 +47,27 @@ def read_native(file: h5py.File, path: Path) -> Native:
     :return: its contents
     :raises DatasetError: if the file is of a newer version, or if an array is missing, too short, or of another kind
     """
+    try:
+        return _read(file, path)
+    except DatasetError:
+        raise
+    except (OSError, RuntimeError, KeyError, IndexError, TypeError, ValueError, OverflowError, MemoryError) as error:
+        problem = f"cannot be read ({' '.join(str(error).split())})"
+        raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+
+
+def _read(file: h5py.File, path: Path) -> Native:
     header = read_header(file, path)
     fields = header.fields()
+    check_plain(file, path, ["n_episodes", *fields])
+    size = os.fstat(file.id.get_vfd_handle()).st_size
     found = {name: file.get(name) for name in ["n_episodes", *fields]}  # looked up once: HDF5 takes most of the time
     for name, array in found.items():
-        if not isinstance(array, h5py.Dataset):
+        if not isinstance(array, h5py.Dataset) or array.shape is None:
             raise DatasetError(path, name, "is missing", "Write the file again with DatasetWriter")
+    for name in ("n_episodes", "episodes/length"):
+        _check_integers(found[name], 0 if name == "n_episodes" else 1, path, name)
+    check_stored(found["episodes/length"], len(found["episodes/length"]), 8, size, path)
     n_episodes, n_steps = _count(found["n_episodes"], found["episodes/length"], path)
     storage: Storage = "contiguous" if found["actions"].chunks is None else "compressed"
     # Map the very file that is open: a writer may have put a larger one at its path in the meantime.
@@ -58,12 +76,14 @@ def read_native(file: h5py.File, path: Path) -> Native:
     for name, spec in fields.items():
         array, rows = found[name], spec.rows(n_episodes, n_steps)
         shape, dtype = array.shape, array.dtype
-        if dtype != spec.dtype or shape[1:] != spec.shape:
-            problem = f"holds rows of shape {shape[1:]} and dtype {dtype}, expected {spec.shape} {spec.dtype}"
+        if dtype != spec.dtype or not shape or shape[1:] != spec.shape:
+            rows_of = f"rows of shape {shape[1:]}" if shape else "a single value"
+            problem = f"holds {rows_of} and dtype {dtype}, expected {spec.shape} {spec.dtype}"
             raise DatasetError(path, name, problem, "Write the file again with DatasetWriter")
         if shape[0] < rows:
             problem = f"has {shape[0]} rows, but {n_episodes} episodes of {n_steps} steps need {rows}"
             raise DatasetError(path, name, problem, "Leave out incomplete episodes, or write the file again")
+        check_stored(array, rows, spec.row_bytes, size, path)
         if not name.startswith(LEFT_IN_THE_FILE) or rows * spec.row_bytes == 0:
             arrays[name] = array[:rows]
         elif mapped is not None and (offset := array.id.get_offset()) is not None:
@@ -71,6 +91,13 @@ def read_native(file: h5py.File, path: Path) -> Native:
         else:
             arrays[name] = HDF5Array(path, name, rows, spec)
     return Native(header, arrays, storage)
+
+
+def _check_integers(array: h5py.Dataset, ndim: int, path: Path, name: str) -> None:
+    if array.ndim != ndim or array.dtype.kind not in "iu":
+        expected = "one integer" if ndim == 0 else "one integer for each episode"
+        problem = f"has shape {array.shape} and dtype {array.dtype}, expected {expected}"
+        raise DatasetError(path, name, problem, "Write the file again with DatasetWriter")
 
 
 def _count(n_episodes: h5py.Dataset, lengths: h5py.Dataset, path: Path) -> tuple[int, int]:
@@ -83,4 +110,7 @@ def _count(n_episodes: h5py.Dataset, lengths: h5py.Dataset, path: Path) -> tuple
     if n and existing.min() < 1:
         problem = f"holds an episode of {existing.min()} steps"
         raise DatasetError(path, "episodes/length", problem, "Leave empty episodes out")
+    if existing.sum(dtype=np.float64) > 2.0**62:
+        problem = f"adds up to more steps than a file can hold, with {existing.max()} in one episode"
+        raise DatasetError(path, "episodes/length", problem, "The file is damaged: take a copy, or write it again")
     return n, int(existing.sum())

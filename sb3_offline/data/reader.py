@@ -17,15 +17,17 @@ from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.foreign.registry import find_path, read_foreign, recognize, unknown_format
 from sb3_offline.data.format import Header, Storage
 from sb3_offline.data.native import is_native, read_native
+from sb3_offline.data.pickles import check_pickle
+from sb3_offline.data.plain import check_all_plain
 
 
 class OfflineDataset:
     """
     A dataset file of format version 1, or data of another library: D4RL-style HDF5 files or dicts, Minari datasets
-    (``minari:namespace/name-v0``, or the folder), replay buffers of Stable-Baselines3 (in memory or pickled; open only pickles
-    that you trust), rollouts of `imitation` (``.npz``, or a folder), folders of LeRobot, files of d3rlpy, and lists of
-    trajectory dicts (in memory or pickled). The format is recognised by the contents. Opening
-    checks the data and raises ``DatasetError``, which names the file, the field and the remedy.
+    (``minari:namespace/name-v0``, or the folder), replay buffers of Stable-Baselines3 (in memory, or pickled), rollouts of
+    `imitation` (``.npz``, or a folder), folders of LeRobot, files of d3rlpy, robomimic, ManiSkill, OGBench, DMC and ALOHA, and
+    lists of trajectory dicts (in memory, or pickled). The format is recognised by the contents. Opening checks the data and
+    raises ``DatasetError``, which names the file, the field and the remedy.
 
     Arrays are flat over all steps. Episode e has its steps at ``step_starts[e] + arange(lengths[e])``, and its observations,
     one more than steps, at ``observation_starts[e] + arange(lengths[e] + 1)``.
@@ -48,6 +50,8 @@ class OfflineDataset:
     :param max_episode_steps: time limit of the environment, for data that do not tell time limits from terminations: rollouts
         of `imitation`, replay buffers without ``handle_timeout_termination``, D4RL-style data without ``timeouts``
     :param episodes: indices of the episodes to read, as if there were no others; they are read into memory
+    :param trust: open pickles that may run any code. Without it, a pickle is opened only if it holds nothing but values of
+        known libraries, such as a ``ReplayBuffer`` of Stable-Baselines3
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class OfflineDataset:
         action_space: spaces.Space | None = None,
         max_episode_steps: int | None = None,
         episodes: Sequence[int] | np.ndarray | None = None,
+        trust: bool = False,
     ):
         self.storage: Storage | str = "memory"
         self._options: dict[str, Any] = {
@@ -65,6 +70,7 @@ class OfflineDataset:
             "action_space": action_space,
             "max_episode_steps": max_episode_steps,
             "episodes": episodes,
+            "trust": trust,
         }
         self._given = find_path(path) if isinstance(path, str | os.PathLike) else path
         with Probe(self._given) as probe:
@@ -92,11 +98,21 @@ class OfflineDataset:
             self._declares_spaces = True
             header, native_arrays, self.storage = read_native(probe.hdf5, probe.path)
             return header, native_arrays
+        if probe.hdf5 is not None:
+            check_all_plain(probe.hdf5, probe.path)
         known = recognize(probe)
         if known is None:
             raise unknown_format(probe)
+        if probe.kind == "pickle" and not self._options["trust"]:
+            with open(probe.path, "rb") as file:
+                check_pickle(
+                    file, probe.path, "file", "If you trust its origin, say so: --trust, or OfflineDataset(path, trust=True)"
+                )
         self._declares_spaces = known.declares_spaces
-        return read_foreign(known, probe, options)
+        header, arrays = read_foreign(known, probe, options)
+        # Other libraries may call an end both a termination and a truncation. Learners never look beyond a termination
+        arrays["truncated"] = np.asarray(arrays["truncated"], dtype=bool) & ~np.asarray(arrays["terminated"], dtype=bool)
+        return header, arrays
 
     @property
     def observations(self) -> Any:
@@ -172,13 +188,14 @@ def _selected(arrays: Mapping[str, Any], episodes: np.ndarray) -> dict[str, Any]
 DatasetSource = str | os.PathLike | OfflineDataset | Sequence[str | os.PathLike | OfflineDataset]
 
 
-def open_datasets(dataset: DatasetSource) -> list[OfflineDataset]:
+def open_datasets(dataset: DatasetSource, *, trust: bool = False) -> list[OfflineDataset]:
     """
     :param dataset: anything that :class:`OfflineDataset` opens, a glob pattern, an open dataset, or a sequence of these
+    :param trust: open pickles that may run any code
     :return: the datasets; those of a pattern are sorted by name
     :raises DatasetError: if there is none, or if two differ in their spaces or in whether they have rewards
     """
-    datasets = list(_open_each(dataset))
+    datasets = list(_open_each(dataset, trust))
     if not datasets:
         raise DatasetError("", "dataset", f"{dataset!r} names no file", "Give at least one dataset file")
     first = datasets[0]
@@ -194,7 +211,7 @@ def open_datasets(dataset: DatasetSource) -> list[OfflineDataset]:
     return datasets
 
 
-def _open_each(dataset: Any) -> Iterator[OfflineDataset]:
+def _open_each(dataset: Any, trust: bool) -> Iterator[OfflineDataset]:
     if isinstance(dataset, OfflineDataset):
         yield dataset
     elif isinstance(dataset, str | os.PathLike):
@@ -202,9 +219,9 @@ def _open_each(dataset: Any) -> Iterator[OfflineDataset]:
         paths = sorted(glob.glob(pattern, recursive=True)) if not os.path.exists(pattern) else [pattern]
         if not paths and glob.has_magic(pattern):
             raise DatasetError(pattern, "dataset", "matches no file", "Check the pattern")
-        yield from (OfflineDataset(path) for path in paths or [pattern])
+        yield from (OfflineDataset(path, trust=trust) for path in paths or [pattern])
     elif isinstance(dataset, Sequence | Set | ValuesView | Iterator) and recognize(Probe(dataset)) is None:
         for part in dataset:
-            yield from _open_each(part)
+            yield from _open_each(part, trust)
     else:
-        yield OfflineDataset(dataset)
+        yield OfflineDataset(dataset, trust=trust)

@@ -1,6 +1,8 @@
 """Gymnasium spaces as JSON, and arrays checked against spaces."""
 
 import json
+import math
+import operator
 import os
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -10,6 +12,9 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
+
+MAX_SIZE = 1 << 26
+"""Largest number of elements of an observation or action in a file: images of 8,000 x 8,000 are smaller."""
 
 
 def space_to_json(space: spaces.Space) -> str:
@@ -53,9 +58,13 @@ def _encode(space: spaces.Space) -> dict[str, Any]:
 def _decode(data: dict[str, Any]) -> spaces.Space:
     kind = data["type"]
     if kind == "Box":
-        shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+        shape, dtype = tuple(operator.index(size) for size in data["shape"]), np.dtype(data["dtype"])
+        if math.prod(shape) > MAX_SIZE:  # before memory is taken for the bounds
+            raise ValueError(f"a space of shape {shape} is too large")
         exact = np.float64 if dtype.kind == "f" else dtype  # floats cannot represent large integers
         low, high = (np.broadcast_to(np.array(data[k], dtype=exact), shape).astype(dtype) for k in ("low", "high"))
+        if not (low <= high).all():  # false for NaN, too
+            raise ValueError("a lower bound is above the upper one, or is no number")
         return spaces.Box(low, high, shape, dtype.type)
     if kind == "Discrete":
         return spaces.Discrete(data["n"], start=data["start"])
@@ -128,9 +137,8 @@ def check_observations(
         checked[field] = check_rows(parts[field], shape, dtype, rows, file, field)
         # Only images: environments often exceed the bounds that they declare for other observations
         if isinstance(subspace, spaces.Box) and dtype.kind == "f" and len(shape) == 3 and checked[field].size:
-            _check_range(checked[field], subspace.low.min(), subspace.high.max(), file, field)
-        elif isinstance(subspace, spaces.Discrete | spaces.MultiDiscrete):
-            _check_choices(checked[field], subspace, file, field)
+            check_range(checked[field], subspace.low.min(), subspace.high.max(), file, field)
+        check_choices(checked[field], subspace, file, field)
     return checked
 
 
@@ -180,7 +188,7 @@ def check_rows(
             if not ((array == 0) | (array == 1)).all():
                 raise DatasetError(file, field, "holds values other than 0 and 1", "Give flags of true and false")
         else:
-            _check_range(array, np.iinfo(dtype).min, np.iinfo(dtype).max, file, field)
+            check_range(array, np.iinfo(dtype).min, np.iinfo(dtype).max, file, field)
     return array.astype(dtype, copy=False)
 
 
@@ -212,19 +220,32 @@ def _shaped(value: Any, shape: tuple[int, ...], rows: int | None, file: str | os
     return array
 
 
-def _check_range(array: np.ndarray, low: Any, high: Any, file: str | os.PathLike, field: str) -> None:
+def check_range(array: np.ndarray, low: Any, high: Any, file: str | os.PathLike, field: str) -> None:
     smallest, largest = array.min(), array.max()
     if smallest < low or largest > high:
         problem = f"holds values in [{smallest}, {largest}], outside of the range [{low}, {high}]"
         raise DatasetError(file, field, problem, "Rescale the values to the space, or declare the space that they have")
 
 
-def _check_choices(
-    array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete, file: str | os.PathLike, field: str
-) -> None:
-    n_choices = space.n if isinstance(space, spaces.Discrete) else space.nvec
-    outside = ((array < space.start) | (array >= space.start + n_choices)).reshape(len(array), -1).any(axis=1)
+def check_choices(array: np.ndarray, space: spaces.Space, file: str | os.PathLike, field: str, first_row: int = 0) -> None:
+    """
+    Check that rows are choices of a space that numbers its choices.
+
+    :param array: ``(n, *space.shape)``
+    :param space: the space; any but Discrete, MultiDiscrete and MultiBinary has no such choices, and nothing is checked then
+    :param file: for error messages
+    :param field: for error messages
+    :param first_row: index of the first of these rows, for error messages
+    :raises DatasetError: if a row is not in the space
+    """
+    if isinstance(space, spaces.MultiBinary):
+        outside = (array < 0) | (array > 1)
+    elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        n_choices = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        outside = (array < space.start) | (array >= space.start + n_choices)
+    else:
+        return
     if outside.any():
-        row = int(np.argmax(outside))
-        problem = f"holds {array[row]} in row {row}, which is not in {space}"
+        row = int(np.argmax(outside.reshape(len(array), -1).any(axis=1)))
+        problem = f"holds {array[row]} in row {first_row + row}, which is not in {space}"
         raise DatasetError(file, field, problem, "Repair the values, or declare the space that they have")

@@ -9,10 +9,12 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
+from sb3_offline.data.checks import BOTH_ENDS
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.files import lock_file, open_hdf5, replacing, temporary_path
+from sb3_offline.data.files import WriteLock, open_hdf5, remove_leftovers, replacing
 from sb3_offline.data.format import Header, create_file, read_header
-from sb3_offline.data.spaces import check_extra, check_observations, check_rows, to_array
+from sb3_offline.data.native import read_native
+from sb3_offline.data.spaces import check_choices, check_extra, check_observations, check_rows, to_array
 
 COPY_BYTES = 1 << 24
 
@@ -25,6 +27,9 @@ class DatasetWriter:
     sparse) and closed. From then on, no HDF5 metadata change. The rows of an episode are written to their places in the
     file and synced to disk. Only then, one write of 8 bytes to ``n_episodes`` makes the episode exist. When the room is used
     up, and at the end, the rows are copied to a new file of the right size, which replaces the old one in one step.
+
+    A new file appears with its first episode, or on closing without an error. From its opening until it is closed, the writer
+    holds a lock (``.NAME.lock`` beside the file), so that a file has one writer at a time. Readers need no lock.
 
     :param path: the file to write; it may begin with ``~``
     :param observation_space: space of one observation (Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these)
@@ -66,7 +71,8 @@ class DatasetWriter:
         self.n_episodes = 0
         self.n_steps = 0
         self._file: Any = None
-        self._replaces = False  # whether the file at the path is an old one that is still to be replaced
+        self._lock: WriteLock | None = None  # held until the writer is closed, also while the file is replaced
+        self._replaces = False  # whether the file is still to be created, or is an old one that is still to be replaced
         self._header = Header(
             observation_space,
             action_space,
@@ -78,7 +84,10 @@ class DatasetWriter:
             success=success,
             extras=dict(extras or {}),
         )
-        self._fields = self._header.fields()
+        try:
+            self._fields = self._header.fields()
+        except DatasetError as error:
+            raise DatasetError(self.path, error.field, error.problem, error.remedy) from error
         try:
             self._open(mode, capacity)
         except BaseException:
@@ -86,16 +95,17 @@ class DatasetWriter:
             raise
 
     def _open(self, mode: str, capacity: tuple[int, int]) -> None:
-        if self.path.exists():
-            if mode == "x":
-                raise DatasetError(self.path, "file", "exists already", 'Open it with mode="a" to append or "w" to replace it')
+        self._header.attributes()  # raises early if an attribute cannot be stored
+        self._lock = WriteLock(self.path)
+        remove_leftovers(self.path)
+        exists = self.path.exists()
+        if exists and mode == "x":
+            raise DatasetError(self.path, "file", "exists already", 'Open it with mode="a" to append or "w" to replace it')
+        if exists and mode == "a":
             self._attach()
-            if mode == "a":
-                self._adopt()
-        temporary_path(self.path).unlink(missing_ok=True)  # left by a killed writer: we hold the lock, so no other is alive
+            self._adopt()
         self._capacity = (self.n_episodes + max(capacity[0], 1), self.n_steps + max(capacity[1], 1))
-        if self._file is not None and mode == "w":
-            self._header.attributes()  # raises early if an attribute cannot be stored
+        if not (exists and mode == "a"):
             self._replaces = True
         else:
             self._rewrite(self._capacity)
@@ -121,14 +131,15 @@ class DatasetWriter:
         :param actions: ``(T, *shape)`` in the environment's units
         :param rewards: (T,) float; required if the file has rewards
         :param terminated: (T,) bool, true at most in the last step (default: false)
-        :param truncated: (T,) bool, true at most in the last step (default: true in the last step if it did not terminate)
+        :param truncated: (T,) bool, true at most in the last step, and not where ``terminated`` is true (default: true in the
+            last step if it did not terminate)
         :param success: (T,) bool, success after each step; required if the file has success labels
         :param extras: the further arrays of the file, each with T rows
         :param seed: seed of the episode, -1 for none
         :param source: one of the file's source labels; required if the file has any
         :raises DatasetError: if anything is invalid; nothing is written then
         """
-        if self._file is None:
+        if self._lock is None:
             raise DatasetError(self.path, "file", "is closed", "Open a new DatasetWriter with mode='a'")
         actions = to_array(actions, self.path, "actions")
         n = len(actions) if actions.ndim else 0
@@ -154,7 +165,7 @@ class DatasetWriter:
 
     def close(self) -> None:
         """Copy the rows to a file of their exact size, unless it has that size, and close it. Further calls do nothing."""
-        if self._file is None:
+        if self._lock is None:
             return
         try:
             if self._replaces or self._capacity != (self.n_episodes, self.n_steps):
@@ -163,6 +174,12 @@ class DatasetWriter:
             self._release()
 
     def _release(self) -> None:
+        self._detach()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _detach(self) -> None:
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -191,6 +208,9 @@ class DatasetWriter:
             if rows[name][:-1].any():
                 remedy = "An episode ends with the step that terminates or truncates it: split it there"
                 raise DatasetError(self.path, name, "is true before the last step", remedy)
+        if rows["terminated"][-1] and rows["truncated"][-1]:
+            raise DatasetError(self.path, "truncated", *BOTH_ENDS)
+        check_choices(rows["actions"], self._header.action_space, self.path, "actions")
         return rows
 
     def _episode_rows(self, n: int, seed: int, source: str | None) -> dict[str, np.ndarray]:
@@ -221,10 +241,9 @@ class DatasetWriter:
         _write_all(self._file, memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data))
 
     def _attach(self) -> None:
-        """Open the file at the path for writing, as the only writer."""
-        self._release()
+        """Open the file at the path for writing. The caller holds the lock."""
+        self._detach()
         self._file = open(self.path, "r+b", buffering=0)
-        lock_file(self._file, self.path)
 
     def _read_places(self, file: h5py.File) -> None:
         self._offsets = {name: file[name].id.get_offset() or 0 for name in [*self._fields, "n_episodes"]}
@@ -233,11 +252,12 @@ class DatasetWriter:
     def _adopt(self) -> None:
         """Take over the episodes and the header of the existing file."""
         with open_hdf5(self.path) as file:
-            present = read_header(file, self.path)
-            self._check_same(present, file["actions"].chunks is not None)
+            read_header(file, self.path)  # the error for a file of another format
+            present, arrays, storage = read_native(file, self.path)  # checks that the places are in this very file
+            self._check_same(present, storage == "compressed")
             self._read_places(file)
-            self.n_episodes = int(file["n_episodes"][()])
-            self.n_steps = int(file["episodes/length"][: self.n_episodes].sum())
+            self.n_episodes = len(arrays["episodes/length"])
+            self.n_steps = int(arrays["episodes/length"].sum())
         header, new_provenance = self._header, self._header.provenance
         header.env_id, header.env_kwargs = present.env_id, present.env_kwargs
         if header.sources is not None and present.sources is not None:
@@ -263,7 +283,7 @@ class DatasetWriter:
         Copy the committed rows to a file of another capacity, which then replaces this one. Without committed rows, create a
         file that is empty or has the rows of its first episode.
         """
-        with replacing(self.path) as temporary:
+        with replacing(self.path, self._lock) as temporary:
             create_file(temporary, self._header, *capacity, committed=1 if first else self.n_episodes)
             if first:
                 with h5py.File(temporary, "r+", locking=False) as file:

@@ -88,7 +88,7 @@ def run_demo(output: Path, settings: DemoSettings) -> str:
     env_kwargs = {"task": settings.task, "obs_type": settings.obs_type}
     rows = [behaviour_row(data["dataset"], settings)]
     for method, run in runs.items():
-        model, config = load_run(run.output / MODEL_FILE)
+        model, config = load_run(run.output / MODEL_FILE, trust=True)
         print(f"Playing {settings.n_final_episodes} episodes of {method}")
         result = evaluate_success(model, ENV_ID, env_kwargs, settings.n_final_episodes)
         rows.append(result_row(method, settings, config["n_timesteps"], settings.n_final_episodes, sum(result.successes)))

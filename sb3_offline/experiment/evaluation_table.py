@@ -1,6 +1,7 @@
 """The CSV file of a run's evaluations."""
 
 import csv
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,16 @@ class EvaluationTable(BaseCallback):
         """
         if not self.path.is_file():
             return []
-        with self.path.open(newline="") as file:
-            return [row for row in csv.DictReader(file) if int(row["step"]) <= until]
+        try:
+            with self.path.open(newline="") as file:
+                found = list(csv.DictReader(file))
+            rows = [row for row in found if int(row["step"]) <= until]
+            for row in rows:
+                _ = int(row["episodes"]), int(row["successes"]), float(row["mean_return"])
+            return rows
+        except (ValueError, TypeError, KeyError, csv.Error) as error:
+            warnings.warn(f"{self.path}: is damaged ({' '.join(str(error).split())}), so its evaluations count as missing.")
+            return []
 
     def steps(self, until: int) -> list[int]:
         """

@@ -53,10 +53,11 @@ def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
             arrays = {name: file[name] for name in file.files}
         config = json.loads(str(arrays.pop(_DESCRIPTION)))
         spaces = [space_from_json(config.pop(name)) for name in ("observation_space", "action_space")]
-    except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        algo, *_ = config["algo"], config["env"], config["env_kwargs"]
+    except (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise RuntimeError(f"{path}: is not a policy file of sb3-offline benchmark --policies ({error})") from error
     kwargs = {key: config[key] for key in ("policy", "policy_kwargs") if key in config}
-    model = create_model(config["algo"], kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))
+    model = create_model(algo, kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))
     for name in [name for name in arrays if name + _UNIT in arrays]:
         arrays[name] = arrays[name] * arrays.pop(name + _UNIT)
     model.actor.load_state_dict({name: th.as_tensor(array) for name, array in arrays.items()})

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from sb3_offline.data.files import replacing
 from sb3_offline.experiment.evaluation import EVALUATION_SEED, PlainObservationPredictor
 
 FRAME_MS = 80
@@ -92,6 +93,7 @@ def record_gif(
             images.append(image.quantize(128, dither=Image.Dither.NONE))
             durations.append(LAST_FRAME_MS if last else FRAME_MS)
     env.close()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        options: dict[str, Any] = {"duration": durations, "loop": 0, "optimize": True}
+        images[0].save(file, "GIF", save_all=True, append_images=images[1:], **options)
     return outcomes

@@ -1,6 +1,7 @@
 """The description of one training run, and its record on the disk."""
 
 import json
+import warnings
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,8 @@ from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.data import given_data
 
 MODEL_FILE, CONFIG_FILE = "model.zip", "config.yml"
+# Record of a run that is to replace a finished one, whose files stay until the new model is whole.
+PENDING_FILE = "config.pending.yml"
 
 
 @dataclass(frozen=True)
@@ -66,16 +69,28 @@ class TrainingRun:
 
     def is_finished(self) -> bool:
         """:return: True if the folder holds the trained model of this run"""
-        return (self.output / MODEL_FILE).is_file() and self.is_recorded()
+        is_replaced = (self.output / PENDING_FILE).is_file()
+        return (self.output / MODEL_FILE).is_file() and not is_replaced and self.is_recorded()
 
 
 def recorded_run(output: Path) -> dict[str, Any] | None:
     """
     :param output: folder of a run
-    :return: the content of its ``config.yml``, or ``None`` if there is no such file
+    :return: the content of its ``config.yml``, or of the record of a run that is to replace it; ``None`` if there is no such
+        file, or if it is damaged, which is said in a warning
     """
-    config_file = output / CONFIG_FILE
-    return yaml.safe_load(config_file.read_text()) if config_file.is_file() else None
+    pending = output / PENDING_FILE
+    config_file = pending if pending.is_file() else output / CONFIG_FILE
+    if not config_file.is_file():
+        return None
+    try:
+        record = yaml.safe_load(config_file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        record = " ".join(str(error).split())
+    if not isinstance(record, dict):
+        warnings.warn(f"{config_file}: is damaged ({str(record)[:200]}), so the run starts from the beginning.")
+        return None
+    return record
 
 
 def _identifier(value: Any) -> str:

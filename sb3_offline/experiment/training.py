@@ -1,6 +1,7 @@
 """Train one model: a config, a dataset and examples become a saved model and a table of evaluations."""
 
 import importlib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,19 +14,24 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_offline
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
+from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
+from sb3_offline.data.pickles import check_model
 from sb3_offline.envs import lacks_task
 from sb3_offline.experiment.data import data_arguments
 from sb3_offline.experiment.evaluation import make_evaluation_env
 from sb3_offline.experiment.evaluation_table import EvaluationTable
-from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, TrainingRun
+from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, TrainingRun
 
 RESUME_FILE = "resume.zip"
+# Beginning of the names of an earlier run's tables, while a new run replaces it.
+EARLIER = "earlier_"
 
 
 class _ReplaceEarlierRun(BaseCallback):
     """
-    Takes over a folder once the data turned out to be good. The files of an earlier run are removed first, so that the new run
+    Takes over a folder once the data turned out to be good. The model of an earlier run and its ``config.yml`` stay until the
+    new model is whole, and its tables stay under other names. A file says that the folder is taken over, so that the new run
     counts as finished only when its own model and tables are there.
     """
 
@@ -34,13 +40,37 @@ class _ReplaceEarlierRun(BaseCallback):
         self.output, self.record = output, record
 
     def _on_training_start(self) -> None:
-        for stale in (self.output / MODEL_FILE, self.output / RESUME_FILE, *self.output.glob("evaluations*.csv")):
-            stale.unlink(missing_ok=True)
-        with replacing(self.output / CONFIG_FILE) as temporary:
-            temporary.write_text(yaml.safe_dump(self.record, sort_keys=False))
+        pending = self.output / PENDING_FILE
+        is_earlier = (self.output / MODEL_FILE).is_file()
+        for table in self.output.glob("evaluations*.csv"):
+            if is_earlier and not pending.is_file():
+                table.replace(table.with_name(EARLIER + table.name))
+            else:
+                table.unlink(missing_ok=True)
+        (self.output / RESUME_FILE).unlink(missing_ok=True)
+        _write_record(pending if is_earlier else self.output / CONFIG_FILE, self.record)
+        if not is_earlier:
+            pending.unlink(missing_ok=True)
 
     def _on_step(self) -> bool:
         return True
+
+
+def _write_record(path: Path, record: dict[str, Any]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+
+
+def _finish(model: BaseAlgorithm, output: Path, record: dict[str, Any]) -> None:
+    """Save the trained model. It replaces that of an earlier run, if there is one, and then the files of that run go."""
+    save_whole(model, output / MODEL_FILE)
+    pending = output / PENDING_FILE
+    if pending.is_file():  # until it is gone, the run does not count as finished
+        _write_record(output / CONFIG_FILE, record)
+        for table in output.glob(f"{EARLIER}evaluations*.csv"):
+            table.unlink(missing_ok=True)
+        pending.unlink()
+    (output / RESUME_FILE).unlink(missing_ok=True)
 
 
 class _SaveForResume(BaseCallback):
@@ -216,8 +246,7 @@ def train_run(
     n_timesteps = config["n_timesteps"] - model.num_timesteps
     is_new = model.num_timesteps == 0
     model.learn(n_timesteps, callback=all_callbacks, reset_num_timesteps=is_new, progress_bar=progress_bar)
-    save_whole(model, run.output / MODEL_FILE)
-    (run.output / RESUME_FILE).unlink(missing_ok=True)
+    _finish(model, run.output, record)
     return model
 
 
@@ -226,7 +255,14 @@ def _saved_model(run: TrainingRun, config: dict[str, Any], tables: list[Evaluati
     file = run.output / RESUME_FILE
     if not (run.save_freq and file.is_file() and run.is_recorded()):
         return None
-    model = find_algorithm(run.algo).load(file, **data_arguments(config, run.dataset, run.examples))
+    arguments = data_arguments(config, run.dataset, run.examples)
+    try:
+        model = find_algorithm(run.algo).load(file, **arguments)
+    except DatasetError:  # the data, not the save
+        raise
+    except Exception as error:  # a damaged zip raises errors of any type
+        warnings.warn(f"{file}: is damaged ({' '.join(str(error).split())[:200]}), so the run starts from the beginning.")
+        return None
     return model if all(table.is_complete(model.num_timesteps) for table in tables) else None
 
 
@@ -260,14 +296,24 @@ def _check_playable(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, 
         raise RuntimeError(f"{env_id} and the data do not fit: {error}; {remedy}") from error
 
 
-def load_run(model_path: Path) -> tuple[OfflineAlgorithm, dict[str, Any]]:
+def load_run(model_path: Path, *, trust: bool = False) -> tuple[OfflineAlgorithm, dict[str, Any]]:
     """
     :param model_path: ``model.zip`` that :func:`train` left, with its ``config.yml`` beside it
+    :param trust: open the file even if it may run any code. Without it, the pickles in it may hold only values of known
+        libraries, as those of a model with the classes of this package do
     :return: the model and the record of its run
+    :raises DatasetError: if the model may run other code
     """
     config_file = model_path.with_name(CONFIG_FILE)
     for file in (model_path, config_file):
         if not file.is_file():
             raise RuntimeError(f"{file}: there is no such file; give the model.zip in the folder of a training run")
-    config = yaml.safe_load(config_file.read_text())
-    return find_algorithm(config["algo"]).load(model_path), config
+    try:
+        config = yaml.safe_load(config_file.read_text(encoding="utf-8"))
+        algo, *_ = config["algo"], config["env"], config["env_kwargs"]
+    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        problem = f"is not the record of a training run ({' '.join(str(error).split())})"
+        raise RuntimeError(f"{config_file}: {problem}; copy it again, or train again") from error
+    if not trust:
+        check_model(model_path, "If you trust its origin, say so: --trust, or load_run(path, trust=True)")
+    return find_algorithm(algo).load(model_path), config

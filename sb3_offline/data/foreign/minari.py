@@ -8,7 +8,9 @@ exactly in ``exact.rewards`` and ``exact.actions``. Metadata are kept in ``prove
 episodes (options of their resets) are kept in ``episode_metadata``, as JSON in the row of the first step.
 """
 
+import contextlib
 import json
+import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
@@ -20,6 +22,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import WriteLock
 from sb3_offline.data.foreign.base import Foreign, Format, Options, Scheme
 from sb3_offline.data.foreign.episodes import checked_observations
 from sb3_offline.data.foreign.probe import Probe
@@ -28,6 +31,7 @@ from sb3_offline.data.spaces import check_rows, space_to_json, subspaces
 
 PREFIX = "minari:"
 DATASET_CLASS = "minari.dataset.minari_dataset.MinariDataset"
+ROOT_VARIABLE = "MINARI_DATASETS_PATH"
 # Metadata that each dataset has of its own: a copy does not take them over.
 OF_THE_COPY = {
     "dataset_id",
@@ -220,30 +224,68 @@ def write(header: Header, arrays: Mapping[str, Any], name: str) -> None:
     """
     name = name.removeprefix(PREFIX)
     folder = dataset_folder(name)
-    if folder.exists():
-        remedy = f"Give another name or version, or delete it (minari delete {name})"
-        raise DatasetError(folder, "dataset", "exists already", remedy)
+    # Minari writes to the folder of all its datasets, so it is given another one, from which the whole dataset is moved. The
+    # root is where Minari keeps a dataset without a namespace.
+    root = dataset_folder(name.rpartition("/")[2]).parent
+    flat = name.replace("/", "%")
+    with WriteLock(root / f"{flat}.dataset"):
+        if folder.exists():
+            remedy = f"Give another name or version, or delete it (minari delete {name})"
+            raise DatasetError(folder, "dataset", "exists already", remedy)
+        staging = root / f".{flat}.tmp"
+        shutil.rmtree(staging, ignore_errors=True)  # left by a killed process: we hold the lock, so no other is alive
+        staging.mkdir(parents=True)
+        try:
+            with _root_of_minari(staging):
+                _create(header, arrays, name)
+            _create_namespace(name)
+            os.replace(staging / name, folder)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _root_of_minari(root: Path) -> Iterator[None]:
+    """Let Minari keep its datasets in another folder. It reads the variable at each call."""
+    before = os.environ.get(ROOT_VARIABLE)
+    os.environ[ROOT_VARIABLE] = str(root)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[ROOT_VARIABLE]
+        else:
+            os.environ[ROOT_VARIABLE] = before
+
+
+def _create_namespace(name: str) -> None:
+    """Register the namespace of a dataset with Minari, as it does when it creates a dataset."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.namespace import create_namespace, list_local_namespaces
+
+    namespace = parse_dataset_id(name)[0]
+    if namespace is not None and namespace not in list_local_namespaces():
+        create_namespace(namespace)
+
+
+def _create(header: Header, arrays: Mapping[str, Any], name: str) -> None:
     import minari
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # Minari warns about a missing author and the like
-            written = minari.create_dataset_from_buffers(
-                name,
-                _episodes(header, arrays),  # type: ignore[arg-type]
-                observation_space=header.observation_space,
-                action_space=header.action_space,
-                jpeg_encoding=False,
-            )
-        written.storage.update_metadata(_metadata(header))
-        labels = _episode_metadata(header, arrays)
-        if any(labels):
-            written.storage.update_episode_metadata(
-                [{"/".join(keys): value for keys, value in _leaves(label)} for label in labels]
-            )
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # Minari warns about a missing author and the like
+        written = minari.create_dataset_from_buffers(
+            name,
+            _episodes(header, arrays),  # type: ignore[arg-type]
+            observation_space=header.observation_space,
+            action_space=header.action_space,
+            jpeg_encoding=False,
+        )
+    written.storage.update_metadata(_metadata(header))
+    labels = _episode_metadata(header, arrays)
+    if any(labels):
+        written.storage.update_episode_metadata(
+            [{"/".join(keys): value for keys, value in _leaves(label)} for label in labels]
+        )
 
 
 def _metadata(header: Header) -> dict[str, Any]:
