@@ -257,7 +257,7 @@ class DatasetWriter:
             self._check_same(present, storage == "compressed")
             self._read_places(file)
             self.n_episodes = len(arrays["episodes/length"])
-            self.n_steps = int(arrays["episodes/length"].sum())
+            self.n_steps = int(np.asarray(arrays["episodes/length"]).sum())
         header, new_provenance = self._header, self._header.provenance
         header.env_id, header.env_kwargs = present.env_id, present.env_kwargs
         if header.sources is not None and present.sources is not None:
