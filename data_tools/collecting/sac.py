@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 from sb3_offline.common.provenance import SIMULATION_PACKAGES, installed_versions
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import save_examples
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 from sb3_offline.data.selection import of_source
 from sb3_offline.data_tools import POLICIES
 from sb3_offline.data_tools.collecting.rollout import (
@@ -182,7 +182,7 @@ def _provenance(collection: Collection, shard: int, n_shards: int) -> dict[str, 
     }
 
 
-def content_hash(source: DatasetSource) -> str:
+def content_hash(source: DatasetLike) -> str:
     """
     Hash what the same seed and versions must reproduce. Files of states and files of images of the same episodes have the same
     hash, and so do the shards and the whole dataset.
@@ -198,7 +198,7 @@ def content_hash(source: DatasetSource) -> str:
     return digest.hexdigest()
 
 
-def success_shares(source: DatasetSource) -> dict[str, float]:
+def success_shares(source: DatasetLike) -> dict[str, float]:
     """
     :param source: dataset files of this program
     :return: by task, the share of episodes that were solved at some decision

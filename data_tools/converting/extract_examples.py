@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import Observations
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 from sb3_offline.data.selection import check_source, of_source
 
 PROGRAM = "sb3_offline.data_tools.converting.extract_examples"
@@ -15,7 +15,7 @@ PROGRAM = "sb3_offline.data_tools.converting.extract_examples"
 
 
 def extract_examples(
-    dataset: DatasetSource, n: int = 200, *, source: str | None = None, seed: int = 0, held_out: bool = False
+    dataset: DatasetLike, n: int = 200, *, source: str | None = None, seed: int = 0, held_out: bool = False
 ) -> tuple[Observations, dict[str, Any]]:
     """
     Draw observations of the solved task: those that follow a step labelled ``success``, uniformly and without repetition.

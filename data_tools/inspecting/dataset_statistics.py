@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.data_tools.inspecting.array_statistics import array_statistics
 from sb3_offline.data_tools.inspecting.dataset_warnings import find_warnings
 from sb3_offline.data_tools.inspecting.example_check import check_examples
@@ -21,7 +21,7 @@ CELL_SIZE = 0.02
 
 
 def inspect_dataset(
-    source: DatasetSource | JoinedDatasets, examples: str | os.PathLike | np.ndarray | None = None
+    source: DatasetLike | JoinedDatasets, examples: str | os.PathLike | np.ndarray | None = None
 ) -> dict[str, Any]:
     """
     Summarise one dataset file, or several files of one environment together. Images are sampled; all other arrays are read

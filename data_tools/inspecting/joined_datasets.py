@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 from sb3_offline.data.storage import RowStore
 
 
@@ -20,7 +20,7 @@ class JoinedDatasets:
     :raises DatasetError: if the files are not of one environment
     """
 
-    def __init__(self, dataset: DatasetSource, *, trust: bool = False):
+    def __init__(self, dataset: DatasetLike, *, trust: bool = False):
         self.parts = open_datasets(dataset, trust=trust)
         first = self.parts[0]
         self.observation_space, self.action_space = first.observation_space, first.action_space

@@ -12,7 +12,7 @@ from sb3_offline.common.hyperparameters import COUNT, POSITIVE, Constraints
 from sb3_offline.common.losses import bellman_loss, effective_share
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, Choice, SearchSpace, log_uniform
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 
 class AWAC(RewardBasedAlgorithm):
@@ -62,7 +62,7 @@ class AWAC(RewardBasedAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 1024,
         tau: float = 0.005,

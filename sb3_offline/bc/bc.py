@@ -12,7 +12,7 @@ from sb3_offline.common.hyperparameters import Constraints, Options
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.common.policies import OfflineActor
 from sb3_offline.common.search import LEARNING, Choice, SearchSpace
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 
 class BC(OfflineAlgorithm):
@@ -50,7 +50,7 @@ class BC(OfflineAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         loss: str = "mse",

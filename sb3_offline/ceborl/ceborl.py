@@ -14,10 +14,10 @@ from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.ceborl.diagnostics import DiagnosticsCallback
 from sb3_offline.ceborl.extraction import EXTRACTIONS, PolicyExtraction
 from sb3_offline.ceborl.losses import conservative_penalty
-from sb3_offline.common.example_based import ExampleSource
+from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, WHOLE, Constraints, Options
 from sb3_offline.common.search import SearchSpace, Uniform, log_uniform
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 #: The paper's Eq. 10 and 11 as its appendix trains them, as constructor arguments. It names every setting of the algorithm;
 #: those that its backup and its policy extraction do not use are the defaults.
@@ -147,8 +147,8 @@ class CEBORL(RecursiveClassifier):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         example_batch_size: int = 256,

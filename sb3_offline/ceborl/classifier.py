@@ -11,11 +11,11 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 from sb3_offline.ceborl.backups import Backup
 from sb3_offline.ceborl.extraction import CriticStep, PolicyExtraction
 from sb3_offline.ceborl.losses import example_loss, mean_of_odds, recursive_loss, success_odds
-from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExamplesLike
 from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE, Constraints, check_parameters
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples, joined
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 #: Gradient steps between two looks at the diagnostics that need extra forward passes.
 DIAGNOSTICS_INTERVAL = 50
@@ -58,8 +58,8 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         *,
         omega_max: float = 1e4,
         class_prior: float = 1.0,

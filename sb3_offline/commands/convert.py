@@ -11,8 +11,8 @@ from sb3_offline.data.reader import OfflineDataset
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: parser of the command"""
-    formats = "D4RL-style file, minari:ID, SB3 replay buffer (.pkl), or rollouts of imitation (.npz, folder)"
-    parser.add_argument("source", help=f"dataset file of either storage, {formats}")
+    formats = "file, folder or minari:ID of another library (LeRobot, robomimic, D4RL, ...)"
+    parser.add_argument("source", help=f"dataset file of either storage, or {formats}")
     parser.add_argument("destination", help="file to write, or minari:ID")
     parser.add_argument(
         "--storage",

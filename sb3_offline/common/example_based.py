@@ -13,9 +13,10 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.hyperparameters import COUNT, Constraints
 from sb3_offline.data.examples import load_examples
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
-ExampleSource = str | PathLike | np.ndarray | dict[str, np.ndarray]
+#: Whatever is accepted where success examples are asked for
+ExamplesLike = str | PathLike | np.ndarray | dict[str, np.ndarray]
 
 
 class ExampleBasedAlgorithm(ActorCriticAlgorithm):
@@ -37,8 +38,8 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         example_batch_size: int = 256,
         **kwargs: Any,
     ):

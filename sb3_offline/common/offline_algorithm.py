@@ -28,7 +28,7 @@ from sb3_offline.common.search import LEARNING, SearchSpace
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
 
@@ -84,7 +84,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         tau: float = 0.005,

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 #: Rewards ``(batch,)`` of a batch of transitions; or ``"success"``, the success labels of the dataset.
 RewardFunction = Callable[[OfflineSamples], Any] | str
@@ -36,7 +36,7 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         reward_fn: RewardFunction | None = None,
         **kwargs: Any,
     ):

@@ -14,7 +14,7 @@ from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, log_uniform
 from sb3_offline.cql.losses import conservative_gaps
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 SelfCQL = TypeVar("SelfCQL", bound="CQL")
 
@@ -73,7 +73,7 @@ class CQL(RewardBasedAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         tau: float = 0.005,

@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 from sb3_offline.data.spaces import same_actions, subspaces
 from sb3_offline.data.storage import RowStore, observation_stores
 
@@ -88,7 +88,7 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def __init__(
         self,
-        dataset: DatasetSource,
+        dataset: DatasetLike,
         observation_space: spaces.Space,
         action_space: spaces.Space,
         device: th.device | str = "auto",

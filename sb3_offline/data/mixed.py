@@ -9,14 +9,14 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.data.buffer import OfflineReplayBuffer, joined
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 
 class _Mixed:
     def __init__(
         self,
         *args: Any,
-        dataset: DatasetSource,
+        dataset: DatasetLike,
         data_ratio: float = 0.5,
         rewards: np.ndarray | None = None,
         checksum: int | None = None,

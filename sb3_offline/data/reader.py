@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_offline.data.arrays import ArrayLike, MappedArray
 from sb3_offline.data.checks import check_values
@@ -185,10 +186,12 @@ def _selected(arrays: Mapping[str, Any], episodes: np.ndarray) -> dict[str, Any]
     return selected
 
 
-DatasetSource = str | os.PathLike | OfflineDataset | Sequence[str | os.PathLike | OfflineDataset]
+#: Whatever is accepted where a dataset is asked for: a path, a glob pattern or an open dataset; an SB3 ``ReplayBuffer``, a
+#: ``MinariDataset``, a dict of D4RL's arrays or a list of trajectory dicts; or a sequence of these
+DatasetLike = str | os.PathLike | OfflineDataset | ReplayBuffer | Mapping[str, Any] | Sequence[Any]
 
 
-def open_datasets(dataset: DatasetSource, *, trust: bool = False) -> list[OfflineDataset]:
+def open_datasets(dataset: DatasetLike, *, trust: bool = False) -> list[OfflineDataset]:
     """
     :param dataset: anything that :class:`OfflineDataset` opens, a glob pattern, an open dataset, or a sequence of these
     :param trust: open pickles that may run any code

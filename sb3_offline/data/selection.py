@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource, OfflineDataset, open_datasets
+from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 
 
-def select_episodes(dataset: DatasetSource, *, source: str | None = None, success: bool | None = None) -> list[OfflineDataset]:
+def select_episodes(dataset: DatasetLike, *, source: str | None = None, success: bool | None = None) -> list[OfflineDataset]:
     """
     Open datasets with only some of their episodes, e.g. to imitate the successful ones.
 

@@ -7,12 +7,12 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExamplesLike
 from sb3_offline.common.hyperparameters import POSITIVE, Constraints, Options
 from sb3_offline.common.search import Choice, SearchSpace, log_uniform
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.dcql.distances import ObservationVectors, mean_distance
 
 
@@ -52,8 +52,8 @@ class DCQL(ExampleBasedAlgorithm, CQL):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         distance: str = "l2",
         reward_scale: float = 1.0,

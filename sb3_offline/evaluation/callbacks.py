@@ -8,11 +8,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.callbacks import log_at_once
-from sb3_offline.common.example_based import ExampleSource
+from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.examples import load_examples
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.evaluation.fitted_q import batches_of, first_steps, fitted_q_evaluation, state_values
 from sb3_offline.evaluation.metrics import judge_probabilities, success_to_come
 
@@ -47,8 +47,8 @@ class OfflineEvalCallback(BaseCallback):
 
     def __init__(
         self,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         eval_freq: int = 1000,
         n_transitions: int = 4096,
         fqe_steps: int = 0,

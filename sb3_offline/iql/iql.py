@@ -11,7 +11,7 @@ from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE, Co
 from sb3_offline.common.losses import bellman_loss, effective_share, expectile_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform, log_uniform
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.iql.losses import exponential_weights
 
 
@@ -64,7 +64,7 @@ class IQL(RewardBasedAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         tau: float = 0.005,

@@ -8,12 +8,12 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 
-from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExampleSource
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExamplesLike
 from sb3_offline.common.hyperparameters import POSITIVE, SHARE, WHOLE, Constraints
 from sb3_offline.common.search import Choice, SearchSpace, log_uniform
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.oril.losses import classifier_loss
 from sb3_offline.oril.reward_model import RewardClassifier
 
@@ -62,8 +62,8 @@ class ORIL(ExampleBasedAlgorithm, CQL):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         example_batch_size: int = 256,
         reward_steps: int = 1000,

@@ -12,10 +12,10 @@ from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.ceborl.diagnostics import DiagnosticsCallback
 from sb3_offline.ceborl.extraction import Maximization, PolicyExtraction
 from sb3_offline.ceborl.losses import odds_of_mean_probability
-from sb3_offline.common.example_based import ExampleSource
+from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.search import SearchSpace, log_uniform
 from sb3_offline.data.buffer import OfflineSamples
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 
 
 class RCE(RecursiveClassifier):
@@ -63,8 +63,8 @@ class RCE(RecursiveClassifier):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
-        examples: ExampleSource | None = None,
+        dataset: DatasetLike | None = None,
+        examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         n_steps: int = 1,
         tau: float = 0.005,

@@ -14,7 +14,7 @@ from sb3_offline.common.reward_based import RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, log_uniform
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.rebrac.losses import penalized_actor_loss, penalized_values, squared_distances
 from sb3_offline.td3_bc.base import OfflineTD3
 
@@ -76,7 +76,7 @@ class ReBRAC(OfflineTD3):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 1e-3,
         batch_size: int = 1024,
         tau: float = 0.005,

@@ -12,7 +12,7 @@ from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, Constraints
 from sb3_offline.common.losses import bellman_loss
 from sb3_offline.common.reward_based import RewardBasedAlgorithm, RewardFunction
 from sb3_offline.data.buffer import OfflineSamples
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.td3_bc.policies import CnnPolicy, DeterministicActor, MlpPolicy, MultiInputPolicy, TD3BCPolicy
 
 
@@ -50,7 +50,7 @@ class OfflineTD3(RewardBasedAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         reward_fn: RewardFunction | None = None,
         policy_delay: int = 2,
         target_policy_noise: float = 0.2,

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from sb3_offline.common.hyperparameters import NOT_NEGATIVE, Constraints
 from sb3_offline.common.reward_based import RewardFunction
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform, UniformInt, log_uniform
-from sb3_offline.data.reader import DatasetSource
+from sb3_offline.data.reader import DatasetLike
 from sb3_offline.td3_bc.base import OfflineTD3
 
 
@@ -60,7 +60,7 @@ class TD3BC(OfflineTD3):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        dataset: DatasetSource | None = None,
+        dataset: DatasetLike | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         tau: float = 0.005,
