@@ -1,5 +1,6 @@
 """
-CQL, IQL and TD3+BC beside those of d3rlpy: the same data, networks, hyperparameters, budget and seeds.
+CQL, IQL and TD3+BC beside those of d3rlpy: the same data, networks, hyperparameters, budget and seeds. AWAC and ReBRAC too,
+where `--algorithms` names them.
 
     python benchmarks/compare_d3rlpy.py
 
@@ -12,7 +13,8 @@ episodes, the same ones for all. A run counts by the mean of its last three chec
 interval of their difference (Welch's, over the seeds).
 
 CQL stands there twice, since the next action of its target is a sample of the policy here (and in the authors' code), and the
-policy's mode in d3rlpy: once both libraries sample, and once both take the mode.
+policy's mode in d3rlpy: once both libraries sample, and once both take the mode. AWAC's target has an entropy term in d3rlpy,
+which neither the paper nor the authors' code has; it is taken out.
 """
 
 import argparse
@@ -31,7 +33,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_offline import CQL, IQL, TD3BC
+from sb3_offline import AWAC, CQL, IQL, TD3BC, ReBRAC
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
@@ -76,6 +78,8 @@ OURS: dict[str, tuple[Any, dict[str, Any]]] = {
     MODE: (ModeTargetCQL, CQL_SETTINGS),
     "IQL": (IQL, {}),
     "TD3+BC": (TD3BC, {}),
+    "AWAC": (AWAC, {}),
+    "ReBRAC": (ReBRAC, {}),
 }
 THEIR_CQL_SETTINGS = {
     # No learning rate of alpha: it stays at 1. The factor in front of the penalty is another argument there.
@@ -89,7 +93,18 @@ THEIRS: dict[str, tuple[Any, dict[str, Any]]] = {
     MODE: (d3rlpy.algos.CQLConfig, THEIR_CQL_SETTINGS),
     "IQL": (d3rlpy.algos.IQLConfig, {"value_encoder_factory": d3rlpy.models.VectorEncoderFactory(NET_ARCH)}),
     "TD3+BC": (d3rlpy.algos.TD3PlusBCConfig, {}),
+    "AWAC": (d3rlpy.algos.AWACConfig, {}),
+    "ReBRAC": (
+        d3rlpy.algos.ReBRACConfig,
+        {
+            "critic_encoder_factory": d3rlpy.models.VectorEncoderFactory(NET_ARCH, use_layer_norm=True),
+            "actor_beta": 0.01,
+            "critic_beta": 0.01,
+        },
+    ),
 }
+#: Those of results/compare_d3rlpy.csv
+FIRST = (SAMPLE, MODE, "IQL", "TD3+BC")
 
 
 def collect(path: Path, n_steps: int) -> None:
@@ -163,21 +178,22 @@ def train_theirs(name: str, path: Path, seed: int) -> list[float]:
         timeouts=np.asarray(dataset.truncated),
     )
     config, settings = THEIRS[name]
+    encoder = d3rlpy.models.VectorEncoderFactory(NET_ARCH)
     algorithm = config(
         actor_learning_rate=LEARNING_RATE,
         critic_learning_rate=LEARNING_RATE,
-        actor_encoder_factory=d3rlpy.models.VectorEncoderFactory(NET_ARCH),
-        critic_encoder_factory=d3rlpy.models.VectorEncoderFactory(NET_ARCH),
         batch_size=BATCH_SIZE,
         tau=TAU,
         gamma=GAMMA,
-        **settings,
+        **{"actor_encoder_factory": encoder, "critic_encoder_factory": encoder, **settings},
         observation_scaler=StandardObservationScaler(),
         action_scaler=MinMaxActionScaler(minimum=dataset.action_space.low, maximum=dataset.action_space.high),
     ).create()
     algorithm.build_with_dataset(data)
     if name == SAMPLE:
         sample_targets(algorithm.impl)
+    if name == "AWAC":
+        algorithm.impl.modules.log_temp._parameter.data.fill_(-th.inf)
     epochs = algorithm.fitter(data, STEPS, EVAL_FREQ, logger_adapter=NoopAdapterFactory(), show_progress=False)
     return [mean_return(TheirPolicy(algorithm)) for _ in epochs]
 
@@ -186,6 +202,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/pendulum_replay.h5"), help="collected where it is missing")
     parser.add_argument("--data-steps", type=int, default=10_000)
+    parser.add_argument("--algorithms", nargs="+", choices=OURS, default=FIRST)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--output", type=Path, default=ROOT / "results" / "compare_d3rlpy.csv")
     args = parser.parse_args()
@@ -200,7 +217,7 @@ def main() -> None:
     # Runs of another protocol are dropped.
     rows = [row for row in rows if (row["algorithm"], row["library"], int(row["seed"])) in done]
     for seed in args.seeds:
-        for name in OURS:
+        for name in args.algorithms:
             for library, train in (("sb3-offline", train_ours), ("d3rlpy", train_theirs)):
                 if (name, library, seed) in done:
                     continue
