@@ -102,7 +102,7 @@ def test_unpickling_trajectories_runs_no_code(tmp_path, monkeypatch):
     [
         (
             {"actions": np.full((3, 2), 1.5)},
-            "actions: reaches from .* to 1.5, and data in the format trajectories declare",
+            "actions: reaches from .* to 1.5, and data of trajectories declare",
         ),
         ({"rewards": np.zeros(2)}, r"trajectory 1: rewards: has shape \(2,\), but there are 3 actions"),
         ({"rewards": None}, "rewards: is missing in trajectory 1, but trajectory 0 has it"),
@@ -509,7 +509,7 @@ def test_cameras_of_other_kinds(tmp_path):
 
 def test_actions_of_lerobot_need_bounds(tmp_path):
     write_lerobot(tmp_path / "robot", "v3.0", action=np.full((15, 2), 9.0))
-    with pytest.raises(DatasetError, match=r"action: reaches from 9 to 9, and LeRobot data declare no.*action_space="):
+    with pytest.raises(DatasetError, match=r"action: reaches from 9 to 9, and data of LeRobot declare no.*action_space="):
         OfflineDataset(tmp_path / "robot")
     space = spaces.Box(-180, 180, (2,))
     assert OfflineDataset(tmp_path / "robot", action_space=space).action_space == space

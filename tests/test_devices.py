@@ -20,7 +20,7 @@ def test_the_pretended_device_refuses_the_cpus_tensors(monkeypatch):
 
 @pytest.mark.parametrize(("algo", "policy"), CASES)
 def test_an_algorithm_keeps_to_its_device(algo, policy, files, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr("sb3_offline.ceborl.ceborl.DIAGNOSTICS_INTERVAL", 1)  # RCE uses it too.
+    monkeypatch.setattr("sb3_offline.ceborl.classifier.DIAGNOSTICS_INTERVAL", 1)  # RCE uses it too.
     with pretend(monkeypatch):
         model = make(algo, policy, files, device=DEVICE).learn(2, log_interval=1)
         assert all(isinstance(parameter, DeviceTensor) for parameter in model.policy.parameters())

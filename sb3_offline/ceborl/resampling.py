@@ -19,6 +19,8 @@ class WeightedTransitions:
     :param n_batches: number of kept batches. A weight is at most that many gradient steps old
     """
 
+    _holds_values_only = True  # so that a saved model opens without consent to run code
+
     def __init__(self, n_batches: int):
         if n_batches < 1:
             raise ValueError(f"The policy has to learn from one batch at least, not from policy_batches={n_batches}")

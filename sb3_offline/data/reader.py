@@ -104,7 +104,7 @@ class OfflineDataset:
         known = recognize(probe)
         if known is None:
             raise unknown_format(probe)
-        if probe.kind == "pickle" and not self._options["trust"]:
+        if probe.kind == "pickle" and known.unpickles and not self._options["trust"]:
             with open(probe.path, "rb") as file:
                 check_pickle(
                     file, probe.path, "file", "If you trust its origin, say so: --trust, or OfflineDataset(path, trust=True)"

@@ -65,6 +65,7 @@ class Format:
         recognise the same data, unless one of them ``refines`` the other
     :param read: reads the data; raises ``DatasetError`` if they are damaged or need an option that was not given
     :param declares_spaces: whether the data say what their spaces are. If not, ``read`` takes them from the options or guesses
+    :param unpickles: whether ``read`` unpickles files by a library that runs any code in them. These are checked before
     :param extra: extra of this package that installs what ``read`` and ``write`` import
     :param refines: names of more general formats that recognise these data too, e.g. "D4RL"
     :param scheme: names that stand for datasets of this format in place of paths
@@ -76,6 +77,7 @@ class Format:
     recognizes: Callable[[Probe], bool]
     read: Callable[[Probe, Options], Foreign]
     declares_spaces: bool
+    unpickles: bool = False
     extra: str = ""
     refines: tuple[str, ...] = ()
     scheme: Scheme | None = None

@@ -135,4 +135,5 @@ FORMAT = Format(
     recognizes=recognizes,
     read=read,
     declares_spaces=True,
+    unpickles=True,
 )
