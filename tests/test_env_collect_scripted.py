@@ -9,9 +9,9 @@ pytest.importorskip("metaworld")
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data_tools.collecting.scripted import collect_scripted, scripted_episodes
 from sb3_offline.data_tools.converting.extract_examples import extract_examples
+from sb3_offline.data_tools.converting.render_dataset import draw_moments
 from sb3_offline.data_tools.inspecting.dataset_statistics import inspect_dataset, table_coverage
 from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
-from sb3_offline.data_tools.render_dataset import draw_moments
 from sb3_offline.envs.multimodal_metaworld import TABLES, TASKS
 from sb3_offline.envs.multimodal_metaworld.scene import JITTER
 
