@@ -65,7 +65,7 @@ def algorithm_table() -> str:
         )
         title = (DOCS / f"algorithms/{name}.md").read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
         paragraph = " ".join((inspect.getdoc(algorithm) or "").partition("\n\n")[0].split()).replace("``", "`")
-        sentence = re.sub(r",? ?https?://[^)\s]+", "", paragraph.partition(". ")[0]).replace(" ()", "")
+        sentence = re.sub(r",? ?https?://[^)\s]+", "", re.split(r"(?<!Eq)\. ", paragraph)[0]).replace(" ()", "")
         sentence = sentence.rstrip(":.").replace("|", r"\|")
         rows.append((place, name, f"| [{title}](algorithms/{name}.md) | {supervision} | {sentence} |"))
     return "\n".join(["| Algorithm | learns from | |", "|---|---|---|", *(row for _, _, row in sorted(rows))]) + "\n"

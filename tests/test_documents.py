@@ -52,6 +52,7 @@ def test_first_page_lists_the_registry():
     table = runpy.run_path(str(ROOT / "docs/conf.py"))["algorithm_table"]()
     assert len(table.splitlines()) == 2 + len(ALGOS)
     assert all(f"](algorithms/{name}.md) |" in table for name in ALGOS)
+    assert "Eq |" not in table  # a sentence does not end at an abbreviation
     assert "```{include} _generated/algorithms.md\n```" in (ROOT / "docs/index.md").read_text()
 
 
