@@ -47,7 +47,7 @@ def draw(table: str, path: Path) -> None:
             play(env, name)
         x = column * (SIZE + GAP)
         ImageDraw.Draw(sheet).text((x + 2, 2), name, fill="black")
-        sheet.paste(Image.fromarray(env.get_picture(SIZE, SIZE)), (x, LABEL))
+        sheet.paste(Image.fromarray(env.get_image(SIZE, SIZE)), (x, LABEL))
         observed = Image.fromarray(env.get_frame()).resize((SIZE, SIZE), Image.Resampling.NEAREST)
         sheet.paste(observed, (x, LABEL + SIZE + GAP))
     # Few colours keep the file small; this method keeps the rare bright ones.

@@ -12,9 +12,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_offline import ALGOS, RCE
+from sb3_offline.common import example_based
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.common.torch_layers import StandardizedExtractor
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.experiment.config import load_config
 from sb3_offline.experiment.training import create_model
@@ -185,6 +187,16 @@ def test_actions_of_two_axes_and_networks_without_hidden_layers(algo, tmp_path):
     kwargs = {"examples": rng.normal(size=(4, 3))} if needs_examples(algo) else {}
     model = ALGOS[algo]("MlpPolicy", None, tmp_path / "d.h5", batch_size=4, policy_kwargs={"net_arch": []}, **kwargs).learn(2)
     assert model.predict(STATES.sample())[0].shape == (2, 3)
+
+
+@pytest.mark.parametrize("algo", ["ceborl", "cql", "oril"])
+@pytest.mark.parametrize("env", [None, "given"])
+def test_each_source_is_opened_once(algo, env, files, monkeypatch):
+    opened, open_dataset, read = [], OfflineDataset._read, example_based.load_examples
+    monkeypatch.setattr(OfflineDataset, "_read", lambda self, *args: opened.append(self.path) or open_dataset(self, *args))
+    monkeypatch.setattr(example_based, "load_examples", lambda *args: opened.append("examples") or read(*args))
+    make(algo, "MlpPolicy", files, env=env and ForbiddenEnv(STATES)).learn(2).learn(1, reset_num_timesteps=False)
+    assert sorted(map(str, opened)) == sorted([files["MlpPolicy"][0], *["examples"] * needs_examples(algo)])
 
 
 def test_no_environment_says_so(files):

@@ -195,7 +195,7 @@ def test_a_recorded_scene_can_be_drawn_again(pixel_env):
     pixel_env.reset(seed=9)
     again = frame_with(pixel_env, state.astype(np.float32))
     assert np.abs(again - frame).mean() < 0.05
-    assert pixel_env.render().shape == (72, 96, 3) and pixel_env.unwrapped.get_picture(200, 150).shape == (150, 200, 3)
+    assert pixel_env.render().shape == (72, 96, 3) and pixel_env.unwrapped.get_image(200, 150).shape == (150, 200, 3)
     with pytest.raises(ValueError, match=r"shape \(30,\)"):
         pixel_env.unwrapped.scene.set_state(state[:-1])
 

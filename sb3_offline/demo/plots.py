@@ -72,7 +72,7 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Pat
         for column, decision in enumerate(shown):
             env.scene.set_state(judged.scene_state[index, decision])
             panel = figure.add_subplot(grid[row, column])
-            panel.imshow(env.get_picture(200, 200))
+            panel.imshow(env.get_image(200, 200))
             panel.set(xticks=[], yticks=[])
             panel.set_title(f"decision {decision}", fontsize=8, color=COLORS[solved])
             panel.spines[:].set_color(COLORS[solved])

@@ -6,7 +6,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
@@ -92,7 +91,7 @@ class OfflineEvalCallback(BaseCallback):
         model = self.model
         model.policy.set_training_mode(False)  # train() sets it again
         found: dict[str, float] = {}
-        if isinstance(model, ActorCriticAlgorithm):
+        if model.value_name is not None:
             initial = state_values(model.critic, model, self.buffer, first_steps(self.buffer))
             found |= {"initial_value": float(initial.mean()), "initial_value_std": float(initial.std())}
             batches = batches_of(self.buffer, self.indices, model._vec_normalize_env)

@@ -164,15 +164,15 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :return: (height, width, 3) uint8, or None without a render_mode
         """
-        return None if self.render_mode is None else self.get_picture(self.width, self.height)
+        return None if self.render_mode is None else self.get_image(self.width, self.height)
 
-    def get_picture(self, width: int, height: int) -> np.ndarray:
+    def get_image(self, width: int, height: int) -> np.ndarray:
         """
         :param width: width in pixels
         :param height: height in pixels
         :return: (height, width, 3) uint8, an image of the scene as it is, for people: finer than the observation
         """
-        return self._get_renderer().picture(width, height)
+        return self._get_renderer().draw(width, height)
 
     def get_frame(self) -> np.ndarray:
         """

@@ -119,7 +119,7 @@ class SceneRenderer:
         """
         return self._draw(self._frame_size, self._frame_size, fine=False)
 
-    def picture(self, width: int, height: int) -> np.ndarray:
+    def draw(self, width: int, height: int) -> np.ndarray:
         """
         :param width: width in pixels
         :param height: height in pixels
