@@ -29,7 +29,7 @@ from sb3_offline.common.choices import CountingFromZero
 from sb3_offline.common.fast import encode, linear_heads, mlp, state_action_values
 from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
 
-# Limit that actions are clamped to before atanh. Actions of a dataset often lie exactly on the bounds, where atanh is infinite.
+# Actions are clamped to this before atanh, which is infinite on the bounds, where actions of a dataset often lie
 ACTION_LIMIT = 0.999
 # Added to tanh's slope before its logarithm is taken, as in SB3
 SQUASHING_EPSILON = 1e-6
