@@ -1,6 +1,7 @@
 import itertools
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium as gym
 import mujoco
@@ -14,6 +15,7 @@ import sb3_offline.envs  # noqa: F401
 pytest.importorskip("metaworld")
 
 from metaworld.asset_path_utils import full_V3_path_for
+from metaworld.envs.sawyer_handle_pull_v3 import SawyerHandlePullEnvV3
 
 from sb3_offline.data_tools.collecting.scripted import SCRIPTS
 from sb3_offline.envs.multimodal_metaworld import STATE_NAMES, TABLES, MultimodalMetaworldEnv, rendering
@@ -237,6 +239,22 @@ def test_any_tasks_share_a_table_that_is_a_dict_of_positions(monkeypatch):
     monkeypatch.setitem(TABLES, "incomplete", {"faucet-close": {}})
     with pytest.raises(ValueError, match=r"'incomplete' places .*but its tasks need faucetBase"):
         make(table="incomplete")
+
+
+def test_a_new_task_is_one_entry_and_may_start_with_a_joint_elsewhere(monkeypatch):
+    press = STOCK_TASKS["handle-press"]
+    box = replace(press.objects["handle_box"], sites={"goalPull": (0.0, -0.216, 0.172)}, start={"handle_slide": -0.1})
+    pull = replace(press, env_class=SawyerHandlePullEnvV3, objects={"handle_box": box})
+    monkeypatch.setitem(STOCK_TASKS, "handle-pull", pull)
+    monkeypatch.setitem(TABLES, "with a new task", {"handle-pull": {"handle_box": (0.1, 0.85, 0.0)}})
+    env = make(table="with a new task").unwrapped
+    for _ in range(2):
+        state, info = env.reset(seed=0)
+        assert env.task == "handle-pull" and not info["success"]
+        assert state[env.state_names.index("handle_slide")] == pytest.approx(-0.1)
+        env.scene.data.joint("handle_slide").qpos[:] = 0.0
+        mujoco.mj_forward(env.scene.model, env.scene.data)
+        assert env.step(np.zeros(4, dtype=np.float32))[4]["success"]
 
 
 @pytest.mark.filterwarnings("ignore:Constant")

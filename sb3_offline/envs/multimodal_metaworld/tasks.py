@@ -26,7 +26,7 @@ class Element(NamedTuple):
     """A named element of an object's file, which would otherwise share its name with an element of another object."""
 
     kind: str
-    """"geom", "joint" or "site"."""
+    """One of "geom", "joint" and "site"."""
     parent: str
     """Name of the body that holds it."""
     name: str
