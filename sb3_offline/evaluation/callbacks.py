@@ -1,5 +1,7 @@
 """A callback that evaluates a model on held-out data."""
 
+from typing import Any
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -88,7 +90,7 @@ class OfflineEvalCallback(BaseCallback):
         """
         :return: the measures by name, without the prefix
         """
-        model = self.model
+        model: Any = self.model  # only models with a critic are asked for it
         model.policy.set_training_mode(False)  # train() sets it again
         found: dict[str, float] = {}
         if model.value_name is not None:
