@@ -212,10 +212,10 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             without its environment
         """
         normalizer = self._vec_normalize_env
-        if not self._observations_normalized:
-            return normalizer if normalizes(normalizer) else None
         if normalizes(normalizer):
             return normalizer
+        if not self._observations_normalized:
+            return None
         if self._saved_normalizer is None:
             self._data.check_normalizer(normalizer)
         assert self._saved_normalizer is not None
