@@ -11,8 +11,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_offline import BC, CEBORL
 from sb3_offline.ceborl import PAPER_FORM, DiagnosticsCallback
 
-#: A target that follows the critic closely, large steps, no penalty: values run away within seconds
-RUNS_AWAY = {**PAPER_FORM, "tau": 0.05, "beta": 0.0, "learning_rate": 3e-3}
+#: The 1-step odds, a target that follows the critic closely, large steps, no penalty: values run away within seconds
+RUNS_AWAY = {**PAPER_FORM, "n_steps": 1, "tau": 0.05, "beta": 0.0, "learning_rate": 3e-3}
 
 
 @pytest.fixture(scope="module")

@@ -160,13 +160,19 @@ def test_with_another_dataset_no_transitions_of_the_old_one_are_drawn(dataset, t
     assert model._extraction.pool.indices.max() < model.replay_buffer.size() and len(model._extraction.pool.indices) == 1
 
 
-def test_paper_form(dataset, monkeypatch):
-    form = {**PAPER_FORM, "gamma": GAMMA, "ent_coef": 0.05, "n_action_samples": 5}
-    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, policy_kwargs=SMALL, **form)
+@pytest.mark.parametrize("n_steps", [1, 10])
+def test_paper_form(dataset, monkeypatch, n_steps):
+    form = {**PAPER_FORM, "gamma": GAMMA, "n_steps": n_steps, "ent_coef": 0.05, "n_action_samples": 5}
+    form["policy_kwargs"] = {**PAPER_FORM["policy_kwargs"], **SMALL}
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, **form)
     reading = Reading(model, monkeypatch)
     batch, examples = reading.batch, reading.examples
-    next_actions = reading.mode(batch.next_observations)
-    omega = np.exp(reading.logits(model.critic_target, batch.next_observations, next_actions).min(axis=0))
+    after = [reading.logits(model.critic_target, h.observations, reading.mode(h.observations)) for h in batch.horizons]
+    if n_steps == 1:  # the letter of Eq. 3
+        omega = np.exp(after[0].min(axis=0))
+    else:  # RCE's authors: the mean of two probabilities, then the lower of the critics
+        c_bar = 0.5 * (sigmoid(after[0]) + batch.horizons[1].discounts.numpy()[:, 0] * sigmoid(after[1]))
+        omega = (c_bar / (1 - c_bar)).min(axis=0)
     f = reading.logits(model.critic, batch.observations, batch.actions)
     f_penalized = reading.logits(model.critic, batch.observations, reading.penalized)
     f_examples = reading.logits(model.critic, examples, reading.mode(examples))
@@ -181,14 +187,15 @@ def test_paper_form(dataset, monkeypatch):
 def test_the_paper_form_names_every_setting():
     """A preset that leaves a setting out would change with the constructor's default."""
     about_the_run = {"policy", "env", "dataset", "examples", "dataset_storage", "stats_window_size", "tensorboard_log"}
-    about_the_run |= {"self", "policy_kwargs", "verbose", "seed", "device", "_init_setup_model"}
+    about_the_run |= {"self", "verbose", "seed", "device", "_init_setup_model"}
     assert PAPER_FORM.keys() == inspect.signature(CEBORL.__init__).parameters.keys() - about_the_run
 
 
 def test_rce_is_the_paper_form_without_the_penalty(dataset):
     data = ("MlpPolicy", None, dataset / "states.h5", EXAMPLES)
     model, paper = RCE(*data), CEBORL(*data, **PAPER_FORM)
-    assert {name: getattr(model, name) for name in PAPER_FORM if hasattr(model, name)}.items() <= PAPER_FORM.items()
+    settings = PAPER_FORM.keys() - {"policy_kwargs"}  # encoders and standard deviations are the paper's own
+    assert {name: getattr(model, name) for name in settings if hasattr(model, name)}.items() <= PAPER_FORM.items()
     for part in ("_backup", "_extraction"):
         assert type(getattr(model, part)) is type(getattr(paper, part))
     with pytest.raises(TypeError, match="beta"):  # what means nothing to it is refused by name
@@ -349,7 +356,7 @@ def test_random_shift_repeats_edges(max_shift):
 
 def test_a_frozen_encoder_stays_frozen(dataset):
     model = CEBORL(
-        "MlpPolicy", None, dataset / "states.h5", EXAMPLES, policy_kwargs=BATCH_NORM, **{**PAPER_FORM, "batch_size": 8}
+        "MlpPolicy", None, dataset / "states.h5", EXAMPLES, **{**PAPER_FORM, "batch_size": 8, "policy_kwargs": BATCH_NORM}
     )
     model.critic.features_extractor.requires_grad_(False)
     model.learn(2)

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_offline.ceborl.losses import mean_of_odds, odds_of_mean_probability
 from sb3_offline.common.losses import expectile_loss
 from sb3_offline.data.buffer import Horizon
 
@@ -22,6 +23,8 @@ class Learner(Protocol):
     critic: Any
     critic_target: Any
     expectile: float
+    gamma: float
+    omega_max: float
 
 
 class Backup:
@@ -48,6 +51,14 @@ class Backup:
         """
         raise NotImplementedError
 
+    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
+        """
+        :param logits: the target's logits after each horizon, ``(n, batch)`` each
+        :param horizons: the horizons
+        :return: ``gamma * omega`` of Eq. 3: the mean of the horizons' discounted odds, ``(batch,)``
+        """
+        return mean_of_odds(logits, _discounts(horizons), self.model.omega_max)
+
     def state_loss(self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         The loss of the head of states, of backups that have ``fits_state_head``.
@@ -60,12 +71,19 @@ class Backup:
         raise NotImplementedError
 
 
+def _discounts(horizons: Sequence[Horizon]) -> list[th.Tensor]:
+    return [horizon.discounts.squeeze(1) for horizon in horizons]
+
+
 class PolicyBackup(Backup):
-    """``a' ~ pi(s')``: the paper's Eq. 3."""
+    """``a' ~ pi(s')``: the paper's Eq. 3. Over two horizons, omega is made of the mean probability, as RCE's authors do."""
 
     def target_logits(self, observations: PyTorchObs, features: th.Tensor, horizons: Sequence[Horizon]) -> th.Tensor:
         actions, _ = self.model.actor.sample(self.model.actor.encode(observations))
         return self.model.critic_target.values(features, actions)  # type: ignore[no-any-return]
+
+    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
+        return odds_of_mean_probability(logits, _discounts(horizons), self.model.gamma, self.model.omega_max)
 
 
 class DatasetBackup(Backup):
@@ -86,6 +104,14 @@ class ExpectileBackup(Backup):
 
     def target_logits(self, observations: PyTorchObs, features: th.Tensor, horizons: Sequence[Horizon]) -> th.Tensor:
         return self.model.critic_target.state_values(features).unsqueeze(0)  # type: ignore[no-any-return]
+
+    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
+        """
+        :param logits: the target's logits after each horizon, ``(n, batch)`` each
+        :param horizons: the horizons
+        :return: ``gamma * omega`` of Eq. 3: the mean of the horizons' discounted odds, ``(batch,)``
+        """
+        return mean_of_odds(logits, _discounts(horizons), self.model.omega_max)
 
     def state_loss(self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         model = self.model

@@ -19,15 +19,16 @@ from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, SH
 from sb3_offline.common.search import SearchSpace, Uniform, log_uniform
 from sb3_offline.data.reader import DatasetLike
 
-#: The paper's Eq. 10 and 11 as its appendix trains them, as constructor arguments. It names every setting of the algorithm;
-#: those that its backup and its policy extraction do not use are the defaults.
+#: The paper's Eq. 10 and 11 with its appendix's settings, as constructor arguments. Where the paper is silent (omega over ten
+#: steps, encoders, the policy's standard deviation), the settings are those of the code of RCE's authors. The preset names every
+#: setting of the algorithm; those that its backup and its policy extraction do not use are the defaults.
 PAPER_FORM: dict[str, Any] = {
     "learning_rate": 3e-4,
     "batch_size": 256,
     "example_batch_size": 256,
     "tau": 0.005,
     "gamma": 0.99,
-    "n_steps": 1,
+    "n_steps": 10,
     "beta": 0.1,
     "n_action_samples": 16,
     "mu": "uniform",
@@ -49,6 +50,7 @@ PAPER_FORM: dict[str, Any] = {
     "target_update_interval": 1,
     "random_shift": 0,
     "policy_random_shift": None,
+    "policy_kwargs": {"share_features_extractor": False, "std_transform": "softplus"},
 }
 
 

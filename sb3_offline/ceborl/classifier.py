@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
 from sb3_offline.ceborl.backups import Backup
 from sb3_offline.ceborl.extraction import CriticStep, PolicyExtraction
-from sb3_offline.ceborl.losses import example_loss, mean_of_odds, recursive_loss, success_odds
+from sb3_offline.ceborl.losses import example_loss, recursive_loss, success_odds
 from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExamplesLike
 from sb3_offline.common.hyperparameters import NOT_NEGATIVE, POSITIVE, SHARE, Constraints, check_parameters
 from sb3_offline.common.search import BOOTSTRAPPING, SearchSpace, Uniform
@@ -187,8 +187,7 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         :param batch: transitions
         :return: ``gamma * omega`` of Eq. 3, the positive weight of each transition in term (c), ``(batch,)``
         """
-        discounts = [horizon.discounts.squeeze(1) for horizon in batch.horizons]
-        return mean_of_odds(self._target_logits(batch), discounts, self.omega_max)
+        return self._backup.discounted_omega(self._target_logits(batch), batch.horizons)
 
     def _example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor | None:
         """:return: ``gamma * omega`` of the examples as their own successors, if they count among the data of term (c)"""

@@ -33,6 +33,8 @@ from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCom
 ACTION_LIMIT = 0.999
 # Added to tanh's slope before its logarithm is taken, as in SB3
 SQUASHING_EPSILON = 1e-6
+# Floor of standard deviations that are made by a softplus
+SOFTPLUS_FLOOR = 1e-3
 
 
 class EncodingActor(CountingFromZero, BasePolicy):
@@ -69,16 +71,20 @@ class OfflineActor(EncodingActor, Actor):
     :param args: see :class:`stable_baselines3.sac.policies.Actor`
     :param std_min: floor of the standard deviation *before* the tanh. A positive floor bounds the likelihood of the dataset's
         actions.
+    :param std_transform: how the network's second output becomes the standard deviation: ``"exp"``, its exponential, as in SB3;
+        or ``"softplus"``, ``1e-3 + log(1 + exp(output))``, as in the code of RCE's authors
     :param kwargs: see :class:`EncodingActor` and :class:`stable_baselines3.sac.policies.Actor`
     """
 
-    def __init__(self, *args: Any, std_min: float = 0.0, **kwargs: Any):
+    def __init__(self, *args: Any, std_min: float = 0.0, std_transform: str = "exp", **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.std_min = std_min
+        if std_transform not in ("exp", "softplus"):
+            raise TypeError(f"std_transform is {std_transform!r}; give 'exp' or 'softplus'")
+        self.std_min, self.std_transform = std_min, std_transform
         self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "std_min": self.std_min}
+        return {**super()._get_constructor_parameters(), "std_min": self.std_min, "std_transform": self.std_transform}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if deterministic:  # SB3's distribution gives the same, but checks its numbers, which cannot be exported.
@@ -97,6 +103,8 @@ class OfflineActor(EncodingActor, Actor):
         """
         assert isinstance(self.mu, nn.Linear) and isinstance(self.log_std, nn.Linear)
         mean, log_std = linear_heads(self.latent_pi, (self.mu, self.log_std), features)
+        if self.std_transform == "softplus":
+            log_std = th.log(SOFTPLUS_FLOOR + nn.functional.softplus(log_std))
         return mean, th.clamp(log_std, self.log_std_min, LOG_STD_MAX)
 
     def sample(self, features: th.Tensor, n_samples: int | None = None) -> tuple[th.Tensor, th.Tensor]:
@@ -246,6 +254,7 @@ class OfflinePolicy(SACPolicy):
     :param lr_schedule: Learning rate schedule (could be constant)
     :param share_features_extractor: let actor and critic share one encoder, which the critic alone trains
     :param std_min: floor of the actor's standard deviation before the tanh
+    :param std_transform: ``"exp"`` or ``"softplus"``, see :class:`OfflineActor`
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
     :param critic_output_bias: initial output of the critics, for all states and actions
     :param critic_state_value: add a critic that sees the state without an action
@@ -269,6 +278,7 @@ class OfflinePolicy(SACPolicy):
         lr_schedule: Schedule,
         share_features_extractor: bool = True,
         std_min: float = 0.0,
+        std_transform: str = "exp",
         critic_layer_norm: bool = False,
         critic_output_bias: float = 0.0,
         critic_state_value: bool = False,
@@ -276,7 +286,7 @@ class OfflinePolicy(SACPolicy):
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ):
-        self.std_min = std_min
+        self.std_min, self.std_transform = std_min, std_transform
         self.mixed_precision = mixed_precision
         self.offline_critic_kwargs: dict[str, Any] = {
             "layer_norm": critic_layer_norm,
@@ -318,7 +328,12 @@ class OfflinePolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineActor:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        actor = OfflineActor(**actor_kwargs, std_min=self.std_min, detach_encoder=self.share_features_extractor)
+        actor = OfflineActor(
+            **actor_kwargs,
+            std_min=self.std_min,
+            std_transform=self.std_transform,
+            detach_encoder=self.share_features_extractor,
+        )
         actor.mixed_precision = self.mixed_precision
         return actor.to(self.device)
 
@@ -333,6 +348,7 @@ class OfflinePolicy(SACPolicy):
         data.update(
             share_features_extractor=self.share_features_extractor,
             std_min=self.std_min,
+            std_transform=self.std_transform,
             mixed_precision=self.mixed_precision,
             **{f"critic_{name}": value for name, value in self.offline_critic_kwargs.items()},
         )

@@ -11,10 +11,8 @@ from sb3_offline.ceborl.backups import Backup, PolicyBackup
 from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.ceborl.diagnostics import DiagnosticsCallback
 from sb3_offline.ceborl.extraction import Maximization, PolicyExtraction
-from sb3_offline.ceborl.losses import odds_of_mean_probability
 from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.search import SearchSpace, log_uniform
-from sb3_offline.data.buffer import OfflineSamples
 from sb3_offline.data.reader import DatasetLike
 
 
@@ -66,7 +64,7 @@ class RCE(RecursiveClassifier):
         dataset: DatasetLike | None = None,
         examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
-        n_steps: int = 1,
+        n_steps: int = 10,
         tau: float = 0.005,
         batch_size: int = 256,
         example_batch_size: int = 256,
@@ -122,7 +120,3 @@ class RCE(RecursiveClassifier):
 
     def default_callbacks(self) -> list[BaseCallback]:
         return [DiagnosticsCallback()]
-
-    def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
-        discounts = [horizon.discounts.squeeze(1) for horizon in batch.horizons]
-        return odds_of_mean_probability(self._target_logits(batch), discounts, self.gamma, self.omega_max)
