@@ -40,8 +40,6 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "16 sampled actions": {"n_action_samples": 16},
     },
     "odds": {
-        "class prior 0.1": {"class_prior": 0.1},
-        "omega at most 1": {"omega_max": 1.0},
         "odds start at 1": {"initial_odds": 1.0},
         "no examples among the data": {"example_share": 0.0},
     },
@@ -50,7 +48,7 @@ GROUPS: dict[str, dict[str, dict[str, Any]]] = {
         "1-step omega": {"n_steps": 1},
         "3-step omega": {"n_steps": 3},
         "omega with the policy's action": {"backup": "policy"},
-        "omega of states: expectile 0.9": {"backup": "expectile", "expectile": 0.9},
+        "omega of states: expectile 0.9": {"backup": "expectile"},
         "tau = 0.005": {"tau": 0.005},
     },
     "networks": {

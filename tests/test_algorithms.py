@@ -302,10 +302,10 @@ def test_critic_values_many_actions_as_one_by_one(files):
 def test_rce_target_is_that_of_its_paper(n_steps, files):
     model = make("rce", "MlpPolicy", files, n_steps=n_steps)
     batch = model.replay_buffer.sample(8)
-    model._target_logits = lambda _: [
-        th.logit(th.full((2, 8), probability)) for probability in (0.6, 0.8)[: len(batch.horizons)]
-    ]
-    omega = model._discounted_omega(batch).numpy()
+    model._backup.target_logits = lambda *_: th.cat(
+        [th.logit(th.full((2, 8), probability)) for probability in (0.6, 0.8)[: len(batch.horizons)]], dim=1
+    )
+    omega = model._backup.discounted_omega(batch).numpy()
     mean = np.full(8, 0.6)
     if n_steps == 3:
         mean = 0.5 * (0.6 + batch.horizons[1].discounts.numpy()[:, 0] * 0.8)
@@ -318,7 +318,7 @@ def test_expectile_backup_takes_the_odds_of_states(files):
     model = make("ceborl", "MlpPolicy", files, backup="expectile", expectile=0.99, n_steps=1, learning_rate=3e-3)
     batch = model.replay_buffer.sample(8)
     expected = model.critic_target.state_values(model.critic_target.encode(batch.next_observations)).exp()
-    th.testing.assert_close(model._discounted_omega(batch), 0.99 * expected)
+    th.testing.assert_close(model._backup.discounted_omega(batch), 0.99 * expected)
     model._update_target = lambda: None
     model.learn(300)
     batch = model.replay_buffer.transitions(np.arange(model.replay_buffer.size()))

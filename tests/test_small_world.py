@@ -43,7 +43,7 @@ def test_without_penalty_the_odds_are_those_of_a_linear_system():
 
 @pytest.mark.parametrize("changes", [{}, {"beta": 0.0}, {"n_steps": 1}])
 def test_bound_holds_for_the_shipped_form_and_its_policy_is_better_than_the_data(changes):
-    learned, true = solve(replace(sw.shipped_form(), **changes))
+    learned, true = solve(replace(sw.IN_SAMPLE, **changes))
     assert (learned <= true * (1 + 1e-6)).all()
     behavior = (WORLD.behavior * WORLD.future_success(WORLD.behavior)).sum(axis=1)
     assert true[sw.START] > 3 * behavior[sw.START]
@@ -51,7 +51,7 @@ def test_bound_holds_for_the_shipped_form_and_its_policy_is_better_than_the_data
 
 @pytest.mark.parametrize(
     "variant",
-    [sw.Variant("RCE", beta=0.0), sw.Variant("paper"), replace(sw.shipped_form(), beta=10.0)],
+    [sw.Variant("RCE", beta=0.0), sw.Variant("paper"), replace(sw.IN_SAMPLE, beta=10.0)],
     ids=["RCE", "paper", "default, beta = 10"],
 )
 def test_bound_is_broken_where_the_page_says_so(variant):

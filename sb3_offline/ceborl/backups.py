@@ -1,19 +1,28 @@
 """
 Backups: the value of the next step in the recursion, from which omega of Eq. 3 is made.
 
-A backup is a small object that says what it needs of the dataset and of the critic, and gives the target critics' logits in
-the observations that transitions lead to. It has no state of its own.
+A backup is a small object that says what it needs of the dataset and of the critic, and gives each transition's omega.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_offline.ceborl.losses import mean_of_odds, odds_of_mean_probability
+from sb3_offline.ceborl.losses import (
+    OVERFLOW,
+    episode_outcomes,
+    mean_of_odds,
+    odds_of_mean_probability,
+    recursive_loss,
+    success_odds,
+)
 from sb3_offline.common.losses import expectile_loss
-from sb3_offline.data.buffer import Horizon
+from sb3_offline.data.buffer import Horizon, OfflineReplayBuffer, OfflineSamples, joined
+from sb3_offline.data.examples import examples_checksum
+from sb3_offline.labelling.classifier import success_probabilities
 
 
 class Learner(Protocol):
@@ -22,9 +31,13 @@ class Learner(Protocol):
     actor: Any
     critic: Any
     critic_target: Any
-    expectile: float
+    augment: Any
     gamma: float
     omega_max: float
+    policy: Any
+    read_examples: Any
+    seed: Any
+    _record: Any
 
 
 class Backup:
@@ -42,6 +55,17 @@ class Backup:
     def __init__(self, model: Learner):
         self.model = model
 
+    def discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
+        """
+        :param batch: transitions
+        :return: ``gamma * omega`` of Eq. 3, the positive weight of each transition in term (c), no gradient, ``(batch,)``
+        """
+        model, horizons = self.model, batch.horizons
+        successors = joined([model.augment(horizon.observations) for horizon in horizons])
+        logits = self.target_logits(successors, model.critic_target.encode(successors), horizons)
+        model._record(omega_clipped=(logits.amin(dim=0) >= math.log(model.omega_max)).float().mean())
+        return self.odds(logits.chunk(len(horizons), dim=1), [horizon.discounts.squeeze(1) for horizon in horizons])
+
     def target_logits(self, observations: PyTorchObs, features: th.Tensor, horizons: Sequence[Horizon]) -> th.Tensor:
         """
         :param observations: the observations after each horizon, one horizon after the other, shifted as in training
@@ -51,28 +75,58 @@ class Backup:
         """
         raise NotImplementedError
 
-    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
+    def odds(self, logits: Sequence[th.Tensor], discounts: Sequence[th.Tensor]) -> th.Tensor:
         """
         :param logits: the target's logits after each horizon, ``(n, batch)`` each
-        :param horizons: the horizons
-        :return: ``gamma * omega`` of Eq. 3: the mean of the horizons' discounted odds, ``(batch,)``
+        :param discounts: ``gamma ** n`` of each horizon, ``(batch,)`` each
+        :return: the discounted odds over all horizons, ``(batch,)``
         """
-        return mean_of_odds(logits, _discounts(horizons), self.model.omega_max)
+        return mean_of_odds(logits, discounts, self.model.omega_max)
 
-    def state_loss(self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def start(self, buffer: OfflineReplayBuffer) -> None:
+        """
+        Called when the data are open.
+
+        :param buffer: the dataset
+        """
+
+    def get_state(self) -> Any:
+        """:return: what a saved model keeps; ``None`` if there is nothing"""
+        return None
+
+    def set_state(self, state: Any) -> None:
+        """:param state: what :meth:`get_state` of the saved model returned"""
+
+    def example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param examples: success examples, shifted as in training
+        :param rows: for each place in the batch its row in the examples, ``(example batch,)``
+        :param actions: the policy's actions there, ``(example batch, action_dim)``
+        :return: ``gamma * omega`` of the examples as their own successors, ``(example batch,)``
+        """
+        target = self.model.critic_target
+        return self.model.gamma * success_odds(target.values(target.encode(examples)[rows], actions), self.model.omega_max)
+
+    def success_odds(self, example_logits: th.Tensor) -> th.Tensor:
+        """
+        :param example_logits: logits of the success examples, ``(n_critics, example batch)``
+        :return: the odds of success itself, the scale of all odds, scalar
+        """
+        return success_odds(example_logits, OVERFLOW).mean()
+
+    def state_loss(
+        self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor, discounted_omega: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         The loss of the head of states, of backups that have ``fits_state_head``.
 
         :param observations: a batch
         :param features: the critic's features of it, ``(batch, features_dim)``
         :param actions: the dataset's actions, ``(batch, action_dim)``
+        :param discounted_omega: what :meth:`discounted_omega` gave, ``(batch,)``
         :return: the head's logits, ``(batch,)``, and the loss, a scalar
         """
         raise NotImplementedError
-
-
-def _discounts(horizons: Sequence[Horizon]) -> list[th.Tensor]:
-    return [horizon.discounts.squeeze(1) for horizon in horizons]
 
 
 class PolicyBackup(Backup):
@@ -82,8 +136,8 @@ class PolicyBackup(Backup):
         actions, _ = self.model.actor.sample(self.model.actor.encode(observations))
         return self.model.critic_target.values(features, actions)  # type: ignore[no-any-return]
 
-    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
-        return odds_of_mean_probability(logits, _discounts(horizons), self.model.gamma, self.model.omega_max)
+    def odds(self, logits: Sequence[th.Tensor], discounts: Sequence[th.Tensor]) -> th.Tensor:
+        return odds_of_mean_probability(logits, discounts, self.model.gamma, self.model.omega_max)
 
 
 class DatasetBackup(Backup):
@@ -101,25 +155,73 @@ class ExpectileBackup(Backup):
 
     needs_next_actions = True
     fits_state_head = True
+    #: 0.5 is the mean, near 1 the best of the dataset's actions
+    expectile: float = 0.9
 
     def target_logits(self, observations: PyTorchObs, features: th.Tensor, horizons: Sequence[Horizon]) -> th.Tensor:
         return self.model.critic_target.state_values(features).unsqueeze(0)  # type: ignore[no-any-return]
 
-    def discounted_omega(self, logits: Sequence[th.Tensor], horizons: Sequence[Horizon]) -> th.Tensor:
-        """
-        :param logits: the target's logits after each horizon, ``(n, batch)`` each
-        :param horizons: the horizons
-        :return: ``gamma * omega`` of Eq. 3: the mean of the horizons' discounted odds, ``(batch,)``
-        """
-        return mean_of_odds(logits, _discounts(horizons), self.model.omega_max)
-
-    def state_loss(self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def state_loss(
+        self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor, discounted_omega: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         model = self.model
         state_logits = model.critic.state_values(features)
         with th.no_grad():
             target_logits = model.critic_target.values(model.critic_target.encode(observations), actions)
-        return state_logits, expectile_loss(target_logits.amin(dim=0) - state_logits, model.expectile)
+        return state_logits, expectile_loss(target_logits.amin(dim=0) - state_logits, self.expectile)
+
+
+class EpisodeBackup(Backup):
+    """
+    Nothing is bootstrapped: omega is the discounted success in the rest of the dataset's own episode, which a classifier of
+    states detects. The classifier is trained on the examples when the data are opened.
+    """
+
+    fits_state_head = True
+
+    def __init__(self, model: Learner):
+        super().__init__(model)
+        self.outcomes: th.Tensor | None = None  # (transitions,), gamma * omega
+        self.made_of: tuple[int, ...] = ()  # identifies the data and the examples that the outcomes belong to
+
+    def start(self, buffer: OfflineReplayBuffer) -> None:
+        model = self.model
+        examples = model.read_examples()
+        made_of = (buffer.checksum(), examples_checksum(examples))
+        if made_of != self.made_of:
+            success = success_probabilities(buffer, examples, seed=model.seed or 0)
+            outcomes = model.gamma * episode_outcomes(success.after, success.lengths, model.gamma)
+            self.outcomes, self.made_of = th.as_tensor(outcomes), made_of
+        assert self.outcomes is not None
+        self.outcomes = self.outcomes.to(buffer.device)
+
+    def get_state(self) -> Any:
+        return None if self.outcomes is None else (self.outcomes.cpu(), self.made_of)
+
+    def set_state(self, state: Any) -> None:
+        self.outcomes, self.made_of = state
+
+    def discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
+        assert self.outcomes is not None and batch.indices is not None
+        return self.outcomes[batch.indices.to(self.outcomes.device)]
+
+    def example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return actions.new_full((len(actions),), self.model.gamma)
+
+    def success_odds(self, example_logits: th.Tensor) -> th.Tensor:
+        return example_logits.new_tensor(self.model.gamma)
+
+    def state_loss(
+        self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor, discounted_omega: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        state_logits = self.model.critic.state_values(features)
+        return state_logits, recursive_loss(state_logits.unsqueeze(0), discounted_omega)
 
 
 #: By the names that ``backup`` takes.
-BACKUPS: dict[str, type[Backup]] = {"dataset": DatasetBackup, "policy": PolicyBackup, "expectile": ExpectileBackup}
+BACKUPS: dict[str, type[Backup]] = {
+    "dataset": DatasetBackup,
+    "policy": PolicyBackup,
+    "expectile": ExpectileBackup,
+    "episode": EpisodeBackup,
+}

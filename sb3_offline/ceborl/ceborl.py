@@ -1,7 +1,7 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -12,16 +12,16 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from sb3_offline.ceborl.backups import BACKUPS, Backup
 from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.ceborl.diagnostics import DiagnosticsCallback
-from sb3_offline.ceborl.extraction import EXTRACTIONS, PolicyExtraction
+from sb3_offline.ceborl.extraction import ADVANTAGES, EXTRACTIONS, PolicyExtraction
 from sb3_offline.ceborl.losses import conservative_penalty
 from sb3_offline.common.example_based import ExamplesLike
-from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, WHOLE, Constraints, Options
+from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, Constraints, Options
 from sb3_offline.common.search import SearchSpace, Uniform, log_uniform
 from sb3_offline.data.reader import DatasetLike
 
 #: The paper's Eq. 10 and 11 with its appendix's settings, as constructor arguments. Where the paper is silent (omega over ten
-#: steps, encoders, the policy's standard deviation), the settings are those of the code of RCE's authors. The preset names every
-#: setting of the algorithm; those that its backup and its policy extraction do not use are the defaults.
+#: steps, encoders, the policy's standard deviation), the settings are those of the code of RCE's authors. The preset names
+#: every setting of the algorithm; those that its backup and its policy extraction do not use are the defaults.
 PAPER_FORM: dict[str, Any] = {
     "learning_rate": 3e-4,
     "batch_size": 256,
@@ -33,23 +33,16 @@ PAPER_FORM: dict[str, Any] = {
     "n_action_samples": 16,
     "mu": "uniform",
     "penalty_space": "probability",
-    "omega_max": 1e4,
-    "class_prior": 1.0,
     "example_share": 0.0,
     "initial_odds": 1.0,
     "backup": "policy",
-    "expectile": 0.9,
     "policy_extraction": "maximize",
     "advantage": "return",
     "temperature": 0.3,
-    "advantage_floor": 0.01,
-    "weight_max": 100.0,
     "state_exponent": 2.0,
-    "policy_batches": 512,
     "ent_coef": 1e-4,
     "target_update_interval": 1,
     "random_shift": 0,
-    "policy_random_shift": None,
     "policy_kwargs": {"share_features_extractor": False, "std_transform": "softplus"},
 }
 
@@ -85,8 +78,6 @@ class CEBORL(RecursiveClassifier):
     :param n_action_samples: K, the number of actions drawn from mu at each state
     :param mu: distribution of the penalised actions: ``"uniform"``, ``"policy"``, or ``"mixture"`` (half of each)
     :param penalty_space: penalise the ``"probability"`` C or the ``"logit"``
-    :param omega_max: upper bound of omega, against overflow. Values of 20 to 60 are normal, so keep it far above
-    :param class_prior: weight of the examples in (b), p(e = 1); the paper drops it (1.0)
     :param example_share: weight of the examples among the data of (c). The odds estimate the ratio of two densities, examples
         over data, which is unbounded where there are no data. With a share eta of examples the ratio is at most 1 / eta (the
         "relative" density ratio)
@@ -95,30 +86,24 @@ class CEBORL(RecursiveClassifier):
     :param backup: next action a' of omega: ``"dataset"``, the dataset's next action; ``"policy"``, the policy's, as in the
         paper; or ``"expectile"``, no action: a state's odds are an upper expectile of the logits of the dataset's actions in
         it, as in IQL
-    :param expectile: the expectile of ``backup="expectile"``: 0.5 is the mean, near 1 the best of the dataset's actions
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
         paper's Eq. 11. The next six belong to ``"weighted"``
     :param advantage: the outcome that the weights compare with the state's odds: ``"return"``: omega, to which the dataset's
         actions led within the n-step window; ``"value"``: the classifier's odds of the dataset's action
     :param temperature: temperature of the advantage weights, which are the ratio of the odds to the power 1 / temperature
-    :param advantage_floor: odds, as a share of the examples' odds, below which advantages are noise and count little
-    :param weight_max: upper bound of the advantage weights
     :param state_exponent: power by which states with odds below the floor count less. An advantage says which action is
         better in a state, but most states of a mixed dataset lead nowhere, and their best action matters little
-    :param policy_batches: number of the last batches whose transitions the policy learns from, drawn by their weights
     :param ent_coef: Entropy coefficient of ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
-    :param policy_random_shift: the same for the images that the policy imitates, and for no others (default:
-        ``random_shift``), for ``policy_extraction="weighted"``
-    :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
-    :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :param kwargs: the other arguments of :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`, such as
+        ``dataset_storage``
     """
 
     _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
@@ -127,15 +112,10 @@ class CEBORL(RecursiveClassifier):
         "mu": [Options(("uniform", "policy", "mixture"))],
         "penalty_space": [Options(("probability", "logit"))],
         "backup": [Options(tuple(BACKUPS))],
-        "expectile": [SHARE],
         "policy_extraction": [Options(tuple(EXTRACTIONS))],
-        "advantage": [Options(("return", "value"))],
+        "advantage": [Options(tuple(ADVANTAGES))],
         "temperature": [POSITIVE],
-        "advantage_floor": [POSITIVE],
-        "weight_max": [POSITIVE],
         "state_exponent": [NOT_NEGATIVE],
-        "policy_batches": [COUNT],
-        "policy_random_shift": [WHOLE, None],
     }
     search_space: ClassVar[SearchSpace] = {
         **RecursiveClassifier.search_space,
@@ -161,31 +141,23 @@ class CEBORL(RecursiveClassifier):
         n_action_samples: int = 16,
         mu: str = "uniform",
         penalty_space: str = "probability",
-        omega_max: float = 1e4,
-        class_prior: float = 1.0,
         example_share: float = 0.02,
         initial_odds: float = 0.01,
         backup: str = "dataset",
-        expectile: float = 0.9,
         policy_extraction: str = "weighted",
         advantage: str = "return",
         temperature: float = 0.3,
-        advantage_floor: float = 0.01,
-        weight_max: float = 100.0,
         state_exponent: float = 2.0,
-        policy_batches: int = 512,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int = 0,
-        policy_random_shift: int | None = None,
-        dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
-        stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ):
         super().__init__(
             policy,
@@ -193,8 +165,6 @@ class CEBORL(RecursiveClassifier):
             dataset,
             examples,
             example_batch_size=example_batch_size,
-            omega_max=omega_max,
-            class_prior=class_prior,
             example_share=example_share,
             initial_odds=initial_odds,
             ent_coef=ent_coef,
@@ -205,28 +175,22 @@ class CEBORL(RecursiveClassifier):
             n_steps=n_steps,
             target_update_interval=target_update_interval,
             random_shift=random_shift,
-            dataset_storage=dataset_storage,
             policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
             seed=seed,
+            **kwargs,
         )
         self.beta = beta
         self.n_action_samples = n_action_samples
         self.mu = mu
         self.penalty_space = penalty_space
         self.backup = backup
-        self.expectile = expectile
         self.policy_extraction = policy_extraction
         self.advantage = advantage
         self.temperature = temperature
-        self.advantage_floor = advantage_floor
-        self.weight_max = weight_max
         self.state_exponent = state_exponent
-        self.policy_batches = policy_batches
-        self.policy_random_shift = policy_random_shift
 
         if _init_setup_model:
             self._setup_model()
@@ -236,9 +200,6 @@ class CEBORL(RecursiveClassifier):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.policy_random_shift and not self._extraction.imitates:
-            remedy = f"policy_extraction={self.policy_extraction!r} imitates no images that it could shift; leave it out"
-            raise TypeError(f"{type(self).__name__}: policy_random_shift is {self.policy_random_shift}, but {remedy}")
         if self.mu == "mixture" and self.n_action_samples == 1:
             raise TypeError(f"{type(self).__name__}: mu='mixture' takes half of the actions each; give n_action_samples >= 2")
 

@@ -34,8 +34,6 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
     :param env: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     :param dataset: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     :param examples: see :class:`~sb3_offline.common.example_based.ExampleBasedAlgorithm`
-    :param omega_max: upper bound of omega, against overflow
-    :param class_prior: weight of the examples in (b), p(e = 1)
     :param example_share: weight of the examples among the data of (c)
     :param initial_odds: odds of the untrained classifier
     :param ent_coef: entropy coefficient of policy extractions that maximise the classifier
@@ -43,14 +41,16 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
     """
 
     _parameter_constraints: ClassVar[Mapping[str, Constraints]] = {
-        "omega_max": [POSITIVE],
-        "class_prior": [POSITIVE],
         "example_share": [SHARE],
         "initial_odds": [POSITIVE],
         "ent_coef": [NOT_NEGATIVE],
     }
     search_space: ClassVar[SearchSpace] = {**BOOTSTRAPPING, "example_share": Uniform(0, 0.1)}
     value_name: ClassVar[str | None] = "C(s, a)"
+    #: upper bound of omega, against overflow. Values of 20 to 60 are normal, so it is far above
+    omega_max: float = 1e4
+    #: weight of the examples in (b), p(e = 1), which the paper drops
+    class_prior: float = 1.0
     _backup: Backup
     _extraction: PolicyExtraction
 
@@ -61,20 +61,18 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         dataset: DatasetLike | None = None,
         examples: ExamplesLike | None = None,
         *,
-        omega_max: float = 1e4,
-        class_prior: float = 1.0,
         example_share: float = 0.0,
         initial_odds: float = 1.0,
         ent_coef: float = 1e-4,
         **kwargs: Any,
     ):
         super().__init__(policy, env, dataset, examples, **kwargs)
-        self.omega_max = omega_max
-        self.class_prior = class_prior
         self.example_share = example_share
         self.initial_odds = initial_odds
         self.ent_coef = ent_coef
-        self._extraction_state: Any = None  # between a saved model and the extraction of the loaded one
+        # Between a saved model and the parts of the loaded one
+        self._extraction_state: Any = None
+        self._backup_state: Any = None
 
     def _make_parts(self) -> tuple[Backup, PolicyExtraction]:
         """:return: a new backup and a new policy extraction, as the constructor's arguments say"""
@@ -86,9 +84,10 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         self.needs_next_actions = self._backup.needs_next_actions
         if "_weighted_transitions" in self.__dict__:  # of a zip that an earlier version saved
             self._extraction_state = self.__dict__.pop("_weighted_transitions"), self.__dict__.pop("_dataset_checksum")
-        if self._extraction_state is not None:
-            self._extraction.set_state(self._extraction_state)
-            self._extraction_state = None
+        for part, name in ((self._backup, "_backup_state"), (self._extraction, "_extraction_state")):
+            if self.__dict__.get(name) is not None:
+                part.set_state(getattr(self, name))
+                setattr(self, name, None)
         super()._setup_model()
 
     def all_policy_kwargs(self) -> dict[str, Any]:
@@ -105,7 +104,8 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
 
     def _on_data_opened(self, buffer: OfflineReplayBuffer) -> None:
         super()._on_data_opened(buffer)
-        self._extraction.start(buffer.checksum())
+        self._backup.start(buffer)
+        self._extraction.start(buffer.checksum(), buffer.size())
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         self.policy.set_training_mode(True)
@@ -121,8 +121,10 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
             example_features = distinct_features[example_rows]
             with th.no_grad():
                 example_actions, _ = self.actor.sample(self._policy_features(examples, example_features, example_rows))
-                discounted_omega = self._discounted_omega(batch)
-                example_omega = self._example_omega(examples, example_rows, example_actions)
+                discounted_omega = self._backup.discounted_omega(batch)
+                example_omega = None
+                if self.example_share > 0:  # the examples count among the data of term (c)
+                    example_omega = self._backup.example_omega(examples, example_rows, example_actions)
 
             # Eq. 10. The rows of `logits` are the critics; a head of states may be one more classifier, the last row.
             both_features = th.cat([features, example_features])
@@ -136,7 +138,7 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
             term_a = self._conservative_term(observations, features, data_logits)
             critic_loss = term_c + term_b + term_a
             if self._backup.fits_state_head:
-                state_logits, state_loss = self._backup.state_loss(observations, features, batch.actions)
+                state_logits, state_loss = self._backup.state_loss(observations, features, batch.actions, discounted_omega)
                 critic_loss = critic_loss + state_loss
             self._optimize(self.critic.optimizer, critic_loss)
 
@@ -147,7 +149,7 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
                 batch.indices,
                 discounted_omega,
                 data_logits.detach(),
-                example_logits.detach(),
+                self._backup.success_odds(example_logits.detach()),
                 state_logits.detach() if self._extraction.needs_state_head else None,
             )
             actor_loss = self._extraction.actor_loss(step)
@@ -182,30 +184,6 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
             loss = loss + self.example_share * recursive_loss(logits, example_omega)
         return loss
 
-    def _discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
-        """
-        :param batch: transitions
-        :return: ``gamma * omega`` of Eq. 3, the positive weight of each transition in term (c), ``(batch,)``
-        """
-        return self._backup.discounted_omega(self._target_logits(batch), batch.horizons)
-
-    def _example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor | None:
-        """:return: ``gamma * omega`` of the examples as their own successors, if they count among the data of term (c)"""
-        if self.example_share == 0:
-            return None
-        target_logits = self.critic_target.values(self.critic_target.encode(examples)[rows], actions)
-        return self.gamma * success_odds(target_logits, self.omega_max)
-
-    def _target_logits(self, batch: OfflineSamples) -> tuple[th.Tensor, ...]:
-        """
-        :param batch: transitions
-        :return: the target's logits after each horizon, ``(n_critics, batch)`` each
-        """
-        successors = joined([self.augment(horizon.observations) for horizon in batch.horizons])
-        logits = self._backup.target_logits(successors, self.critic_target.encode(successors), batch.horizons)
-        self._record(omega_clipped=(logits.amin(dim=0) >= math.log(self.omega_max)).float().mean())
-        return logits.chunk(len(batch.horizons), dim=1)
-
     @th.no_grad()
     def _record_diagnostics(self, observations: PyTorchObs, features: th.Tensor, omega: th.Tensor) -> None:
         actions, log_prob = self.actor.sample(self._policy_features(observations, features))
@@ -218,9 +196,9 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         )
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        self._extraction_state = self._extraction.get_state()
+        self._backup_state, self._extraction_state = self._backup.get_state(), self._extraction.get_state()
         super().save(path, exclude, include)
-        self._extraction_state = None
+        self._backup_state = self._extraction_state = None
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_backup", "_extraction"]

@@ -21,12 +21,11 @@ _REMEDIES = {
     "classifier_saturated": (
         "C is above {saturated} on {classifier_saturated:.0%} of the data: the classifier takes most of it for success, and "
         "the gradient of the penalty, C (1 - C), is gone. Try, in this order: backup='dataset' and initial_odds=0.01 (the "
-        "defaults); class_prior=0.1; example_share=0.02; policy_kwargs={{'critic_layer_norm': True}}; data with more failures"
+        "defaults); example_share=0.02; policy_kwargs={{'critic_layer_norm': True}}; data with more failures"
     ),
     "omega_clipped": (
-        "The target's odds are at omega_max={omega_max:g} for {omega_clipped:.0%} of the data: the values run away, or the "
-        "bound is so low that it flattens their order. If the classifier is saturated, see there. Otherwise raise omega_max "
-        "(1e4 is the default; odds of 20 to 60 are normal)"
+        "The target's odds are at their bound of {omega_max:g} for {omega_clipped:.0%} of the data: the values run away (odds "
+        "of 20 to 60 are normal). If the classifier is saturated, see there. Otherwise try n_steps=10 or a smaller tau"
     ),
     "actions_on_bounds": (
         "The policy sits on the bounds of the action space, with {actions_on_bounds:.0%} of its actions' entries against "
@@ -43,8 +42,7 @@ _REMEDIES = {
     ),
     "weights_collapsed": (
         "The policy imitates as much as {effective_transitions:.0f} transitions of the {n_kept} that it draws from: its "
-        "weights are too sharp. Raise temperature (now {temperature:g}) or advantage_floor (now {advantage_floor:g}), or "
-        "lower weight_max"
+        "weights are too sharp. Raise temperature (now {temperature:g})"
     ),
 }
 
@@ -121,8 +119,8 @@ class DiagnosticsCallback(BaseCallback):
         more = found["actions_on_bounds"] - found["data_actions_on_bounds"]
         n_kept, effective_transitions = 0, math.inf
         extraction = self.model._extraction
-        if isinstance(extraction, WeightedRegression) and extraction.pool.weights.numel():
-            n_kept = extraction.pool.weights.numel()
+        if isinstance(extraction, WeightedRegression):
+            n_kept = int((extraction.pool.weights > 0).sum())
             effective_transitions = float(extraction.pool.effective_share()) * n_kept
         wrong = {
             "classifier_saturated": found["classifier_saturated"] > SATURATED_SHARE,
@@ -133,7 +131,7 @@ class DiagnosticsCallback(BaseCallback):
         }
         about = {
             **found,
-            **{name: getattr(self.model, name, None) for name in ("omega_max", "temperature", "advantage_floor")},
+            **{name: getattr(self.model, name, None) for name in ("omega_max", "temperature")},
             "saturated": SATURATED_CLASSIFIER,
             "effective_transitions": effective_transitions,
             "n_kept": n_kept,

@@ -5,6 +5,7 @@ An extraction is a small object that says what it needs of the networks, owns th
 and gives the actor's loss.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch as th
@@ -23,7 +24,7 @@ class CriticStep(NamedTuple):
     :param indices: indices of the transitions in the dataset, ``(batch,)``
     :param discounted_omega: ``gamma * omega`` of each transition, ``(batch,)``
     :param data_logits: logits of the dataset's actions, ``(n_critics, batch)``
-    :param example_logits: logits of the success examples, ``(n_critics, example batch)``
+    :param success: the odds of success itself, as the backup counts them, scalar
     :param state_logits: logits of the head of states, ``(batch,)``; ``None`` without that head
     """
 
@@ -32,8 +33,20 @@ class CriticStep(NamedTuple):
     indices: th.Tensor
     discounted_omega: th.Tensor
     data_logits: th.Tensor
-    example_logits: th.Tensor
+    success: th.Tensor
     state_logits: th.Tensor | None
+
+
+def _odds_of_actions(step: CriticStep) -> th.Tensor:
+    return success_odds(step.data_logits, OVERFLOW)
+
+
+#: By the names that ``advantage`` takes: the outcomes that the advantage weights compare with the odds of the states
+ADVANTAGES: dict[str, Callable[[CriticStep], th.Tensor]] = {
+    "return": lambda step: step.discounted_omega,
+    "value": _odds_of_actions,
+    "mean": lambda step: (step.discounted_omega * _odds_of_actions(step)).sqrt(),
+}
 
 
 class Learner(Protocol):
@@ -54,10 +67,7 @@ class WeightingLearner(Learner, Protocol):
 
     advantage: str
     temperature: float
-    advantage_floor: float
-    weight_max: float
     state_exponent: float
-    policy_batches: int
     policy_random_shift: int | None
 
 
@@ -85,11 +95,12 @@ class PolicyExtraction:
         """
         raise NotImplementedError
 
-    def start(self, checksum: int) -> None:
+    def start(self, checksum: int, n_transitions: int) -> None:
         """
         Called when the data are open.
 
         :param checksum: checksum of the dataset; state that belongs to another dataset is dropped
+        :param n_transitions: number of transitions of the dataset
         """
 
     def get_state(self) -> Any:
@@ -113,19 +124,23 @@ class Maximization(PolicyExtraction):
 
 class WeightedRegression(PolicyExtraction):
     """
-    The policy imitates the dataset's actions, weighted by their advantage. The transitions of the last batches are kept with
-    their weights, and the policy learns from those that are drawn by weight.
+    The policy imitates the dataset's actions, weighted by their advantage. Each transition keeps the weight that it had when
+    the critic last saw it, and the policy learns from those that are drawn by weight.
     """
 
     needs_state_head = True
     imitates = True
     std_min = 0.05
+    #: odds, as a share of the odds of success, below which advantages are noise and count little
+    advantage_floor: float = 0.01
+    #: upper bound of the advantage weights
+    weight_max: float = 100.0
     model: WeightingLearner
 
     def __init__(self, model: WeightingLearner):
         super().__init__(model)
-        self.pool = WeightedTransitions(model.policy_batches)
-        self.checksum: int | None = None  # of the dataset that the pool's indices belong to
+        self.pool = WeightedTransitions(0)
+        self.checksum: int | None = None  # of the dataset that the weights belong to
 
     def get_state(self) -> Any:
         return self.pool, self.checksum
@@ -133,10 +148,9 @@ class WeightedRegression(PolicyExtraction):
     def set_state(self, state: Any) -> None:
         self.pool, self.checksum = state
 
-    def start(self, checksum: int) -> None:
-        # A loaded model may have another dataset, or keep more or fewer batches
-        if (checksum, self.model.policy_batches) != (self.checksum, self.pool.n_batches):
-            self.pool, self.checksum = WeightedTransitions(self.model.policy_batches), checksum
+    def start(self, checksum: int, n_transitions: int) -> None:
+        if (checksum, n_transitions) != (self.checksum, len(self.pool.weights)):  # a loaded model may have another dataset
+            self.pool, self.checksum = WeightedTransitions(n_transitions), checksum
 
     def actor_loss(self, step: CriticStep) -> th.Tensor:
         self.pool.add(step.indices, self.weights(step))
@@ -148,14 +162,13 @@ class WeightedRegression(PolicyExtraction):
     def weights(self, step: CriticStep) -> th.Tensor:
         """:return: the advantage weights of a batch, ``(batch,)``"""
         assert step.state_logits is not None
-        outcomes = {"return": lambda: step.discounted_omega, "value": lambda: success_odds(step.data_logits, OVERFLOW)}
         return odds_ratio_weights(
-            outcomes[self.model.advantage](),
+            ADVANTAGES[self.model.advantage](step),
             step.state_logits,
-            step.example_logits,
+            step.success,
             self.model.temperature,
-            self.model.advantage_floor,
-            self.model.weight_max,
+            self.advantage_floor,
+            self.weight_max,
             self.model.state_exponent,
         )
 
@@ -163,7 +176,7 @@ class WeightedRegression(PolicyExtraction):
         """:return: the policy's features and the dataset's actions of n kept transitions, drawn by their weights"""
         model = self.model
         observations, actions = model.replay_buffer.pairs(self.pool.draw(n), env=model._vec_normalize_env)
-        return model.actor.encode(model.augment(observations, model.policy_random_shift)), actions
+        return model.actor.encode(model.augment(observations)), actions
 
 
 #: By the names that ``policy_extraction`` takes.

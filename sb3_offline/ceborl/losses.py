@@ -8,6 +8,7 @@ serve as the Q-value. All logits carry the critics as their first axis. Everythi
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch as th
 from torch.nn import functional as F
 
@@ -70,6 +71,28 @@ def odds_of_mean_probability(
     return gamma * success_odds(th.logit(total / len(target_logits), eps=PROBABILITY_EPSILON), omega_max)
 
 
+def episode_outcomes(probabilities: np.ndarray, lengths: np.ndarray, gamma: float) -> np.ndarray:
+    """
+    The discounted success in the rest of each episode: ``max_k gamma ** k * p(s_{t+1+k})``.
+
+    This is omega of Eq. 3 without bootstrapping. The paper reads the odds as the probability of success in the discounted
+    future (Eq. 7), and an episode of the dataset shows how that future went.
+
+    :param probabilities: (N,) probability that the observation after each step shows success
+    :param lengths: (E,) number of steps of each episode, N in all
+    :param gamma: discount factor
+    :return: (N,) float32 between 0 and 1
+    """
+    ends = np.cumsum(lengths)
+    best, outcomes = np.zeros(len(lengths)), np.empty(len(probabilities), np.float32)
+    for back in range(1, int(lengths.max(initial=0)) + 1):  # all episodes at once, from their last steps to their first
+        longer = np.flatnonzero(lengths >= back)
+        steps = ends[longer] - back
+        best[longer] = np.maximum(probabilities[steps], gamma * best[longer])
+        outcomes[steps] = best[longer]
+    return outcomes
+
+
 def conservative_penalty(data_logits: th.Tensor, sampled_logits: th.Tensor, penalty_space: str = "probability") -> th.Tensor:
     """
     Term (a) without its ``beta``: ``E_mu[C(s, a)] - E_D[C(s, a)]``, the first as a log-mean-exp over K sampled actions.
@@ -115,7 +138,7 @@ def recursive_loss(data_logits: th.Tensor, discounted_omega: th.Tensor) -> th.Te
 def odds_ratio_weights(
     odds: th.Tensor,
     state_logits: th.Tensor,
-    example_logits: th.Tensor,
+    success: th.Tensor,
     temperature: float,
     advantage_floor: float,
     weight_max: float,
@@ -126,21 +149,20 @@ def odds_ratio_weights(
     state is: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) ** state_exponent``.
 
     The advantage is a ratio because odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share
-    of the examples' odds. Where both odds are far below it, their ratio is noise: the first factor is about 1, and the second
+    of the odds of success. Where both odds are far below it, their ratio is noise: the first factor is about 1, and the second
     is small. Where both are above it, the second factor is about 1, so the way to success counts as much as its end.
 
     :param odds: outcomes of the dataset's actions: learned odds, or the targets that they are learned from, ``(batch,)``
     :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
-    :param example_logits: logits of success examples, which set the scale of the odds, ``(n_critics, batch)``
+    :param success: the odds of success itself, which set the scale of the odds, scalar
     :param temperature: the smaller, the sharper the weights
-    :param advantage_floor: eps as a share of the examples' mean odds
+    :param advantage_floor: eps as a share of the odds of success
     :param weight_max: upper bound of the first factor; the second is at most 1
     :param state_exponent: how much less unpromising states count; 0: all states count alike
     :return: ``(batch,)``
     """
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
-    example_odds = success_odds(example_logits, OVERFLOW).mean()
-    eps = advantage_floor * example_odds
+    eps = advantage_floor * success
     log_ratio = th.log(odds + eps) - th.log(state_odds + eps)
     weights = (log_ratio / temperature).clamp(max=math.log(weight_max)).exp()
     return weights * (state_odds / (state_odds + eps)) ** state_exponent

@@ -1,4 +1,4 @@
-"""A pool of weighted transitions, from which batches are drawn by weight."""
+"""Weighted transitions, from which batches are drawn by weight."""
 
 from typing import Any
 
@@ -7,69 +7,59 @@ import torch as th
 
 from sb3_offline.common.losses import effective_share
 
+#: Transitions for which the running sum of the weights is computed anew at each draw; of more, it is as many draws old
+SUMMED_AT_ONCE = 500_000
+
 
 class WeightedTransitions:
     """
-    The transitions of the last batches, drawn again in proportion to their weights.
+    A weight for each transition of a dataset, by which transitions are drawn.
 
     A weighted loss over a uniform batch learns from the few transitions that have weight: about one in fifteen if the data
     hold five tasks, each solved now and then. If transitions are drawn by weight, all of a batch count alike, and the expected
     loss is the same.
 
-    :param n_batches: number of kept batches. A weight is at most that many gradient steps old
+    :param n_transitions: number of transitions N of the dataset. None is drawn before it has a weight
     """
 
     _holds_values_only = True  # so that a saved model opens without consent to run code
 
-    def __init__(self, n_batches: int):
-        if n_batches < 1:
-            raise ValueError(f"The policy has to learn from one batch at least, not from policy_batches={n_batches}")
-        self.n_batches = n_batches
-        self._n_added = 0
-        # Rings of batches, allocated when the batch size is known
-        self._indices = th.empty(0, 0, dtype=th.int64)
-        self._weights = th.empty(0, 0)
-
-    @property
-    def indices(self) -> th.Tensor:
-        """(kept batches, batch) int64, indices of the transitions in the dataset; the batches are in no particular order"""
-        return self._indices[: self._n_added]
-
-    @property
-    def weights(self) -> th.Tensor:
-        """(kept batches, batch), the transitions' weights"""
-        return self._weights[: self._n_added]
+    def __init__(self, n_transitions: int):
+        #: (N,) float32, the last weight of each transition, 0 before the first one
+        self.weights = th.zeros(n_transitions)
+        self._sums = th.zeros(0, dtype=th.float64)
+        self._draws_left = 0
 
     def add(self, indices: th.Tensor, weights: th.Tensor) -> None:
         """
-        Keep a batch in place of the oldest one. A batch of another size than before empties the pool first.
-
-        :param indices: (batch,) int64 on the CPU, indices of the transitions in the dataset
-        :param weights: ``(batch,)``, positive, no gradient
+        :param indices: (batch,) int64 on the CPU, indices of transitions
+        :param weights: ``(batch,)``, their new weights, not negative, no gradient
         """
-        if len(indices) != self._indices.shape[1]:
-            self._n_added = 0
-            self._indices = indices.new_zeros(self.n_batches, len(indices))
-            self._weights = weights.new_zeros(self.n_batches, len(indices))
-        self._weights = self._weights.to(weights.device)  # a loaded model has them on the CPU
-        row = self._n_added % self.n_batches
-        self._indices[row], self._weights[row] = indices, weights
-        self._n_added += 1
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_weights": self._weights.cpu()}  # a saved model also loads where its device is missing
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update({"_indices" if name == "_steps" else name: value for name, value in state.items()})  # older zips
+        if self.weights.device != weights.device:
+            self.weights = self.weights.to(weights.device)  # a new or loaded model has them on the CPU
+        self.weights[indices.to(weights.device)] = weights.float()
 
     def draw(self, n: int) -> np.ndarray:
         """
         :param n: number of transitions
         :return: (n,) indices of transitions, drawn with replacement
         """
-        drawn = th.multinomial(self.weights.flatten(), n, replacement=True)
-        return self.indices.flatten()[drawn.cpu()].numpy()
+        if self._draws_left == 0:
+            self._sums = self.weights.cumsum(0, dtype=th.float64)
+            self._draws_left = 1 + len(self.weights) // SUMMED_AT_ONCE
+        self._draws_left -= 1
+        # Above 0, so that no transition without a weight is drawn
+        drawn = (1 - th.rand(n, dtype=th.float64, device=self._sums.device)) * self._sums[-1]
+        return th.searchsorted(self._sums, drawn).clamp(max=len(self._sums) - 1).cpu().numpy()
 
     def effective_share(self) -> th.Tensor:
-        """:return: scalar, the share of the transitions that would carry as much if all weights were equal"""
-        return effective_share(self.weights.flatten())
+        """:return: scalar, the share of the weighted transitions that would carry as much if all weights were equal"""
+        return effective_share(self.weights[self.weights > 0])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"weights": self.weights.cpu()}  # a saved model also loads where its device is missing
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Models of earlier versions kept their last batches, which weigh no dataset as a whole: those start anew
+        self.__init__(0)  # type: ignore[misc]
+        self.weights = state.get("weights", self.weights)

@@ -71,7 +71,7 @@ class OfflineActor(EncodingActor, Actor):
     :param args: see :class:`stable_baselines3.sac.policies.Actor`
     :param std_min: floor of the standard deviation *before* the tanh. A positive floor bounds the likelihood of the dataset's
         actions.
-    :param std_transform: how the network's second output becomes the standard deviation: ``"exp"``, its exponential, as in SB3;
+    :param std_transform: how the second output becomes the standard deviation: ``"exp"``, its exponential, as in SB3;
         or ``"softplus"``, ``1e-3 + log(1 + exp(output))``, as in the code of RCE's authors
     :param kwargs: see :class:`EncodingActor` and :class:`stable_baselines3.sac.policies.Actor`
     """

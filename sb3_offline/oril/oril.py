@@ -1,6 +1,5 @@
 """ORIL: Offline Reinforced Imitation Learning, from examples of success."""
 
-import zlib
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -13,6 +12,7 @@ from sb3_offline.common.hyperparameters import POSITIVE, SHARE, WHOLE, Constrain
 from sb3_offline.common.search import Choice, SearchSpace, log_uniform
 from sb3_offline.cql.cql import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.examples import examples_checksum
 from sb3_offline.data.reader import DatasetLike
 from sb3_offline.oril.losses import classifier_loss
 from sb3_offline.oril.reward_model import RewardClassifier
@@ -130,10 +130,10 @@ class ORIL(ExampleBasedAlgorithm, CQL):
 
     def _training_settings(self) -> dict[str, Any]:
         """:return: everything that the classifier depends on, apart from the dataset"""
-        examples, checksum = self.read_examples(), 0
-        for array in examples.values() if isinstance(examples, dict) else [examples]:
-            checksum = zlib.crc32(array.tobytes(), checksum)
-        return {"examples": checksum, **{name: getattr(self, name) for name in self._classifier_settings}}
+        return {
+            "examples": examples_checksum(self.read_examples()),
+            **{name: getattr(self, name) for name in self._classifier_settings},
+        }
 
     @classmethod
     def load(cls, path: Any, *args: Any, **kwargs: Any) -> "ORIL":  # type: ignore[override]

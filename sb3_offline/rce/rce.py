@@ -38,8 +38,6 @@ class RCE(RecursiveClassifier):
     :param batch_size: Transitions in a batch
     :param example_batch_size: Success examples in a batch
     :param gamma: the discount factor
-    :param omega_max: upper bound of omega, against overflow
-    :param class_prior: weight of the examples in (b), p(e = 1); the authors drop it (1.0)
     :param example_share: weight of the examples among the data of (c), see :class:`~sb3_offline.ceborl.ceborl.CEBORL`
     :param initial_odds: odds of the untrained classifier, see :class:`~sb3_offline.ceborl.ceborl.CEBORL`
     :param ent_coef: Entropy coefficient
@@ -69,8 +67,6 @@ class RCE(RecursiveClassifier):
         batch_size: int = 256,
         example_batch_size: int = 256,
         gamma: float = 0.99,
-        omega_max: float = 1e4,
-        class_prior: float = 1.0,
         example_share: float = 0.0,
         initial_odds: float = 1.0,
         ent_coef: float = 1e-4,
@@ -91,8 +87,6 @@ class RCE(RecursiveClassifier):
             dataset,
             examples,
             example_batch_size=example_batch_size,
-            omega_max=omega_max,
-            class_prior=class_prior,
             example_share=example_share,
             initial_odds=initial_odds,
             ent_coef=ent_coef,
