@@ -20,7 +20,7 @@ from sb3_offline.ceborl.losses import (
     success_odds,
 )
 from sb3_offline.common.losses import expectile_loss
-from sb3_offline.data.buffer import Horizon, OfflineReplayBuffer, OfflineSamples, joined
+from sb3_offline.data.buffer import Horizon, OfflineReplayBuffer, OfflineSamples, Pairs, joined
 from sb3_offline.data.examples import examples_checksum
 from sb3_offline.labelling.classifier import success_probabilities
 
@@ -34,10 +34,11 @@ class Learner(Protocol):
     augment: Any
     gamma: float
     omega_max: float
-    policy: Any
     read_examples: Any
+    replay_buffer: Any
     seed: Any
     _record: Any
+    _vec_normalize_env: Any
 
 
 class Backup:
@@ -55,9 +56,16 @@ class Backup:
     def __init__(self, model: Learner):
         self.model = model
 
-    def discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
+    def sample(self, batch_size: int) -> OfflineSamples | Pairs:
         """
-        :param batch: transitions
+        :param batch_size: number of transitions
+        :return: a batch, with what :meth:`discounted_omega` needs of it
+        """
+        return self.model.replay_buffer.sample(batch_size, env=self.model._vec_normalize_env)  # type: ignore[no-any-return]
+
+    def discounted_omega(self, batch: Any) -> th.Tensor:
+        """
+        :param batch: transitions, from :meth:`sample`
         :return: ``gamma * omega`` of Eq. 3, the positive weight of each transition in term (c), no gradient, ``(batch,)``
         """
         model, horizons = self.model, batch.horizons
@@ -201,8 +209,11 @@ class EpisodeBackup(Backup):
     def set_state(self, state: Any) -> None:
         self.outcomes, self.made_of = state
 
-    def discounted_omega(self, batch: OfflineSamples) -> th.Tensor:
-        assert self.outcomes is not None and batch.indices is not None
+    def sample(self, batch_size: int) -> Pairs:
+        return self.model.replay_buffer.sample_pairs(batch_size, env=self.model._vec_normalize_env)  # type: ignore[no-any-return]
+
+    def discounted_omega(self, batch: Pairs) -> th.Tensor:
+        assert self.outcomes is not None
         return self.outcomes[batch.indices.to(self.outcomes.device)]
 
     def example_omega(self, examples: PyTorchObs, rows: th.Tensor, actions: th.Tensor) -> th.Tensor:

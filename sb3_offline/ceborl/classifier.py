@@ -112,7 +112,7 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
 
         for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            batch = self._backup.sample(batch_size)
             observations = self.augment(batch.observations)
             examples, example_rows = self.sample_examples()
             examples = self.augment(examples)

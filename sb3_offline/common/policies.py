@@ -15,11 +15,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim, is_image_space
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
@@ -73,18 +72,25 @@ class OfflineActor(EncodingActor, Actor):
         actions.
     :param std_transform: how the second output becomes the standard deviation: ``"exp"``, its exponential, as in SB3;
         or ``"softplus"``, ``1e-3 + log(1 + exp(output))``, as in the code of RCE's authors
+    :param dropout: share of the hidden units that are left out at random when learning
     :param kwargs: see :class:`EncodingActor` and :class:`stable_baselines3.sac.policies.Actor`
     """
 
-    def __init__(self, *args: Any, std_min: float = 0.0, std_transform: str = "exp", **kwargs: Any):
+    def __init__(self, *args: Any, std_min: float = 0.0, std_transform: str = "exp", dropout: float = 0.0, **kwargs: Any):
         super().__init__(*args, **kwargs)
         if std_transform not in ("exp", "softplus"):
             raise TypeError(f"std_transform is {std_transform!r}; give 'exp' or 'softplus'")
-        self.std_min, self.std_transform = std_min, std_transform
+        self.std_min, self.std_transform, self.dropout = std_min, std_transform, dropout
+        if dropout:
+            layers = [
+                (layer, nn.Dropout(dropout)) if isinstance(layer, self.activation_fn) else (layer,) for layer in self.latent_pi
+            ]
+            self.latent_pi = nn.Sequential(*(part for layer in layers for part in layer))
         self.log_std_min = max(LOG_STD_MIN, float(th.tensor(std_min).log())) if std_min > 0 else LOG_STD_MIN
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "std_min": self.std_min, "std_transform": self.std_transform}
+        own = {"std_min": self.std_min, "std_transform": self.std_transform, "dropout": self.dropout}
+        return {**super()._get_constructor_parameters(), **own}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if deterministic:  # SB3's distribution gives the same, but checks its numbers, which cannot be exported.
@@ -255,6 +261,7 @@ class OfflinePolicy(SACPolicy):
     :param share_features_extractor: let actor and critic share one encoder, which the critic alone trains
     :param std_min: floor of the actor's standard deviation before the tanh
     :param std_transform: ``"exp"`` or ``"softplus"``, see :class:`OfflineActor`
+    :param actor_dropout: share of the actor's hidden units that are left out at random when learning
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
     :param critic_output_bias: initial output of the critics, for all states and actions
     :param critic_state_value: add a critic that sees the state without an action
@@ -279,6 +286,7 @@ class OfflinePolicy(SACPolicy):
         share_features_extractor: bool = True,
         std_min: float = 0.0,
         std_transform: str = "exp",
+        actor_dropout: float = 0.0,
         critic_layer_norm: bool = False,
         critic_output_bias: float = 0.0,
         critic_state_value: bool = False,
@@ -286,7 +294,7 @@ class OfflinePolicy(SACPolicy):
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ):
-        self.std_min, self.std_transform = std_min, std_transform
+        self.std_min, self.std_transform, self.actor_dropout = std_min, std_transform, actor_dropout
         self.mixed_precision = mixed_precision
         self.offline_critic_kwargs: dict[str, Any] = {
             "layer_norm": critic_layer_norm,
@@ -332,6 +340,7 @@ class OfflinePolicy(SACPolicy):
             **actor_kwargs,
             std_min=self.std_min,
             std_transform=self.std_transform,
+            dropout=self.actor_dropout,
             detach_encoder=self.share_features_extractor,
         )
         actor.mixed_precision = self.mixed_precision
@@ -349,6 +358,7 @@ class OfflinePolicy(SACPolicy):
             share_features_extractor=self.share_features_extractor,
             std_min=self.std_min,
             std_transform=self.std_transform,
+            actor_dropout=self.actor_dropout,
             mixed_precision=self.mixed_precision,
             **{f"critic_{name}": value for name, value in self.offline_critic_kwargs.items()},
         )

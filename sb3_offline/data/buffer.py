@@ -65,6 +65,20 @@ class OfflineSamples(NamedTuple):
     indices: th.Tensor | None = None
 
 
+class Pairs(NamedTuple):
+    """
+    B pairs of observation and action, without what followed.
+
+    :param observations: as ``OfflineSamples.observations``
+    :param actions: (B, A) scaled to [-1, 1]
+    :param indices: (B,) int64 on the CPU, indices of their transitions
+    """
+
+    observations: Observations
+    actions: th.Tensor
+    indices: th.Tensor
+
+
 class OfflineReplayBuffer(ReplayBuffer):
     """
     A fixed ``ReplayBuffer`` over one or several dataset files.
@@ -181,6 +195,15 @@ class OfflineReplayBuffer(ReplayBuffer):
         :return: steps drawn uniformly, with replacement
         """
         return self.transitions(self.rng.integers(0, self.buffer_size, batch_size), env)
+
+    def sample_pairs(self, batch_size: int, env: VecNormalize | None = None) -> Pairs:
+        """
+        :param batch_size: number of pairs B
+        :param env: normalises observations
+        :return: the observations and actions of the same transitions that :meth:`sample` would draw
+        """
+        indices = self.rng.integers(0, self.buffer_size, batch_size)
+        return Pairs(*self.pairs(indices, env), th.as_tensor(indices))
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> OfflineSamples:  # type: ignore[override]
         return self.transitions(batch_inds, env)  # the name that SB3 knows
