@@ -19,6 +19,6 @@ def positive_unlabelled_loss(example_logits: th.Tensor, data_logits: th.Tensor, 
     """
     positives, negatives = F.softplus(-example_logits).mean(), F.softplus(data_logits).mean()
     if positive_share > 0:
-        # Below zero, the network has learned the examples by heart; the absolute value then takes a step back, as the authors do
+        # Below zero, the network has learned the examples by heart. The absolute value then takes a step back, as in the paper
         negatives = (negatives - positive_share * F.softplus(example_logits).mean()).abs() / (1 - positive_share)
     return positives + negatives
