@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent.parent
 FLOORS = [
     ["data", "envs", "parallel"],
     ["common"],
+    ["labelling"],
     ["ALGORITHMS"],
     ["evaluation"],
     ["data_tools", "experiment"],
@@ -96,5 +97,5 @@ def test_imports_point_to_lower_rooms():
 def test_below_the_registry_nobody_asks_it():
     known = modules()
     for name, path in known.items():
-        if room_of(name) in ("data", "envs", "common", "ALGORITHMS", "evaluation", "data_tools"):
+        if room_of(name) in ("data", "envs", "common", "labelling", "ALGORITHMS", "evaluation", "data_tools"):
             assert "sb3_offline" not in imports_of(path, known), f"{path.relative_to(ROOT)} imports the package's face"

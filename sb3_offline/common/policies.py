@@ -26,7 +26,13 @@ from torch import nn
 
 from sb3_offline.common.choices import CountingFromZero
 from sb3_offline.common.fast import encode, linear_heads, mlp, state_action_values
-from sb3_offline.common.torch_layers import NormalizedNatureCNN, StandardizedCombinedExtractor, StandardizedExtractor
+from sb3_offline.common.torch_layers import (
+    NormalizedNatureCNN,
+    StandardizedCombinedExtractor,
+    StandardizedExtractor,
+    fit_statistics,
+    standardized_encoders,
+)
 
 # Actions are clamped to this before atanh, which is infinite on the bounds, where actions of a dataset often lie
 ACTION_LIMIT = 0.999
@@ -371,34 +377,12 @@ class OfflinePolicy(SACPolicy):
         :param statistics: function that returns (mean, variance, count) of the dataset's observations, or a dict of such
             triples for the given keys of dict observations. It is called only if there is something to fit.
         """
-        unfitted = {encoder: key for encoder, key in self._standardized_encoders().items() if not encoder.fitted}
-        if unfitted:
-            moments = statistics([key for key in unfitted.values() if key] or None)
-            for encoder, key in unfitted.items():
-                mean, variance, _ = moments[key] if key else moments
-                encoder.fit(np.asarray(mean), np.asarray(variance))
+        fit_statistics(self, statistics)
 
     @property
     def standardizes(self) -> bool:
         """``True`` once the statistics of a dataset are fitted."""
-        return any(bool(encoder.fitted) for encoder in self._standardized_encoders())
-
-    def _standardized_encoders(self) -> dict[StandardizedExtractor, str]:
-        """
-        :return: the encoders of vectors, with their keys in dict observations. One-hot vectors and flattened images are not
-            standardised.
-        """
-        encoders = {
-            module: ""
-            for module in self.modules()
-            if isinstance(module, StandardizedExtractor)
-            and isinstance(module._observation_space, spaces.Box)
-            and not is_image_space(module._observation_space, check_channels=False)
-        }
-        for module in self.modules():
-            if isinstance(module, StandardizedCombinedExtractor):
-                encoders.update({part: key for key, part in module.extractors.items() if part in encoders})
-        return encoders
+        return any(bool(encoder.fitted) for encoder in standardized_encoders(self))
 
 
 MlpPolicy = OfflinePolicy

@@ -1,5 +1,8 @@
 """Encoders of observations."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -94,3 +97,38 @@ class StandardizedCombinedExtractor(CombinedExtractor):
             else:
                 continue  # One-hot vectors are not standardised.
             self.extractors[key] = encoder
+
+
+def standardized_encoders(network: nn.Module) -> dict[StandardizedExtractor, str]:
+    """
+    :param network: a network with encoders in it
+    :return: its encoders of vectors, with their keys in dict observations. One-hot vectors and flattened images are not
+        standardised.
+    """
+    encoders = {
+        module: ""
+        for module in network.modules()
+        if isinstance(module, StandardizedExtractor)
+        and isinstance(module._observation_space, spaces.Box)
+        and not is_image_space(module._observation_space, check_channels=False)
+    }
+    for module in network.modules():
+        if isinstance(module, StandardizedCombinedExtractor):
+            encoders.update({part: key for key, part in module.extractors.items() if part in encoders})
+    return encoders
+
+
+def fit_statistics(network: nn.Module, statistics: Callable[[list[str] | None], Any]) -> None:
+    """
+    Fit every :class:`StandardizedExtractor` of a network that is not fitted yet.
+
+    :param network: a network with encoders in it
+    :param statistics: function that returns (mean, variance, count) of the dataset's observations, or a dict of such
+        triples for the given keys of dict observations. It is called only if there is something to fit.
+    """
+    unfitted = {encoder: key for encoder, key in standardized_encoders(network).items() if not encoder.fitted}
+    if unfitted:
+        moments = statistics([key for key in unfitted.values() if key] or None)
+        for encoder, key in unfitted.items():
+            mean, variance, _ = moments[key] if key else moments
+            encoder.fit(np.asarray(mean), np.asarray(variance))

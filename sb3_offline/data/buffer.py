@@ -129,8 +129,7 @@ class OfflineReplayBuffer(ReplayBuffer):
             if datasets[0].guessed_actions:
                 remedy = "The file declares no bounds: give OfflineDataset(path, action_space=...)"
             raise DatasetError(datasets[0].path, "action_space", problem, remedy)
-        lengths = np.concatenate([d.lengths for d in datasets])
-        self._index_steps(lengths)
+        self._index_steps(self.lengths)
         self.actions = self._scaled_actions()
         self.rewards = self._file_rewards = self._concatenate("rewards", np.zeros(n_steps_total, np.float32))
         self.dones = self._concatenate("terminated").astype(np.float32)
@@ -241,7 +240,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         """
         other = object.__new__(type(self))  # a copy would read the files again
         other.__dict__.update(self.__dict__, n_steps=1, next_actions=False)
-        other._index_steps(np.concatenate([dataset.lengths for dataset in self.datasets]))
+        other._index_steps(self.lengths)
         return other
 
     def pairs(self, indices: np.ndarray, env: VecNormalize | None = None) -> tuple[Observations, th.Tensor]:
@@ -251,6 +250,22 @@ class OfflineReplayBuffer(ReplayBuffer):
         :return: ``observations`` and ``actions`` of these transitions
         """
         return self._observations(self._observation_rows[indices], env), self._scaled_actions_at(indices)
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """The numbers of steps of all episodes, (E,) int64, through all files in their order."""
+        return np.concatenate([dataset.lengths for dataset in self.datasets])
+
+    def observations_at(self, rows: np.ndarray, env: VecNormalize | None = None) -> Observations:
+        """
+        Read observations without transitions. An episode of n steps has n + 1 rows: episode e begins at row
+        ``lengths[:e].sum() + e``.
+
+        :param rows: (B,) indices of observations below ``size() + len(lengths)``, counted through all files in their order
+        :param env: normalises the observations
+        :return: these observations, in this order, as ``OfflineSamples.observations``
+        """
+        return self._observations(rows, env)
 
     def _scaled_actions_at(self, indices: np.ndarray) -> th.Tensor:
         return self._to_device(self.actions.take(indices, axis=0))
@@ -350,7 +365,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         :param gamma: discount factor of ``VecNormalize``
         :return: the variance over all steps
         """
-        lengths = np.concatenate([dataset.lengths for dataset in self.datasets])
+        lengths = self.lengths
         starts, returns = np.cumsum(lengths) - lengths, self.rewards.astype(np.float64)
         for t in range(1, int(lengths.max())):
             steps = starts[lengths > t] + t

@@ -1,0 +1,233 @@
+"""A classifier of success from examples: the probability that an observation of the data shows the solved task."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_offline.common.augmentation import has_images, shift_observations
+from sb3_offline.common.choices import CountingFromZero
+from sb3_offline.common.fast import encode, mlp
+from sb3_offline.common.torch_layers import (
+    NormalizedNatureCNN,
+    StandardizedCombinedExtractor,
+    StandardizedExtractor,
+    fit_statistics,
+)
+from sb3_offline.data.buffer import OfflineReplayBuffer
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.examples import Observations
+from sb3_offline.labelling.calibration import Calibration, calibrate
+from sb3_offline.labelling.losses import positive_unlabelled_loss
+
+#: Makes a new, untrained encoder of observations, e.g. ``policy.make_features_extractor``
+EncoderFactory = Callable[[], BaseFeaturesExtractor]
+
+SCORED_AT_ONCE = 512
+VECTOR_STEPS, IMAGE_STEPS = 300, 200
+
+
+class ClassifierSettings(NamedTuple):
+    """
+    How the classifier is trained. The defaults were chosen on the second table of tasks.
+
+    :param n_models: networks, each trained without one share of the episodes and of the examples, which it then judges
+    :param gradient_steps: gradient steps of each; ``None`` for 300 from vectors and 200 from images
+    :param batch_size: observations of the data in a batch, beside as many examples
+    :param learning_rate: learning rate
+    :param weight_decay: L2 penalty
+    :param net_arch: hidden layers on top of the encoder
+    :param max_shift: largest random shift of images in pixels
+    :param positive_share: share of the data's observations that look like the examples, where it is known; 0 takes all for
+        failures in the loss
+    """
+
+    n_models: int = 3
+    gradient_steps: int | None = None
+    batch_size: int = 256
+    learning_rate: float = 3e-4
+    weight_decay: float = 1e-2
+    net_arch: tuple[int, ...] = (256, 256)
+    max_shift: int = 4
+    positive_share: float = 0.0
+
+
+class StepProbabilities(NamedTuple):
+    """
+    The probability of success of every observation of some data.
+
+    :param rows: (N + E,) float32, of each observation: episode e of n steps has n + 1 of them, one after the other
+    :param lengths: (E,) int64, steps of each episode
+    :param calibration: how logits became probabilities
+    """
+
+    rows: np.ndarray
+    lengths: np.ndarray
+    calibration: Calibration
+
+    @property
+    def before(self) -> np.ndarray:
+        """(N,) float32, for each step the probability of the observation that it starts in."""
+        return np.delete(self.rows, np.cumsum(self.lengths + 1) - 1)
+
+    @property
+    def after(self) -> np.ndarray:
+        """
+        (N,) float32, for each step the probability of the observation that it leads to. Success labels of environments are
+        of this observation, so it decides about episodes and gives rewards.
+        """
+        return np.delete(self.rows, np.cumsum(self.lengths + 1) - self.lengths - 1)
+
+
+class StateClassifier(CountingFromZero):
+    """
+    A network that tells success examples from the observations of a dataset. It has its own encoder and sees no action.
+
+    :param observation_space: Observation space, images channel-first
+    :param action_space: Action space
+    :param features_extractor: encoder of the observations
+    :param net_arch: hidden layers on top of it
+    :param kwargs: see :class:`stable_baselines3.common.policies.BaseModel`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        features_extractor: BaseFeaturesExtractor,
+        net_arch: list[int],
+        **kwargs: Any,
+    ):
+        super().__init__(observation_space, action_space, features_extractor=features_extractor, **kwargs)
+        self.head = nn.Sequential(*create_mlp(features_extractor.features_dim, 1, net_arch))
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :param observations: uint8 images channel-first or float vectors (or a dict of them), batch first
+        :return: logits, ``(batch,)``
+        """
+        return mlp(self.head, encode(self._features, observations, None)).squeeze(1)
+
+    def _features(self, observations: PyTorchObs) -> th.Tensor:
+        encoder = self.features_extractor
+        assert encoder is not None
+        if isinstance(encoder, NormalizedNatureCNN) and self.normalize_images:
+            return encoder(observations)  # It scales uint8 images by itself, which is cheaper than SB3's preprocessing.
+        return self.extract_features(observations, encoder)
+
+
+def success_probabilities(
+    buffer: OfflineReplayBuffer,
+    examples: Observations,
+    settings: ClassifierSettings | None = None,
+    *,
+    make_encoder: EncoderFactory | None = None,
+    seed: int = 0,
+) -> StepProbabilities:
+    """
+    Train classifiers on success examples against the data, and compute the probability of success of all observations.
+
+    No observation is judged by a network that was trained on its episode: each of ``n_models`` networks leaves out one share
+    of the episodes and of the examples, and judges these. What it says of the examples and data that it did not see also
+    calibrates the probabilities. Global random numbers stay as they are.
+
+    :param buffer: the data, on the device to compute on. Its observations are read as the files hold them
+    :param examples: ``(n, *observation)`` in the buffer's space (images channel-first), or a dict of these; from
+        :func:`~sb3_offline.data.examples.load_examples`
+    :param settings: how to train (default: ``ClassifierSettings()``)
+    :param make_encoder: makes a new encoder of observations (default: that of our ``MlpPolicy``, ``CnnPolicy`` or
+        ``MultiInputPolicy``, by the space)
+    :param seed: seed of networks, folds and batches
+    :return: the probabilities; the same ones for the same arguments on one device
+    :raises DatasetError: if there are fewer examples or episodes than networks
+    """
+    settings = settings or ClassifierSettings()
+    lengths, arrays = buffer.lengths, _columns(examples)
+    n_examples = len(next(iter(arrays.values())))
+    k = settings.n_models
+    for field, n in (("episodes", len(lengths)), ("examples", n_examples)):
+        if n < max(k, 2):
+            problem = f"are {n}, but the classifier needs {max(k, 2)} at least, to be judged on those that it has not seen"
+            raise DatasetError(buffer.datasets[0].path, field, problem, f"Give more {field}")
+    rng = np.random.default_rng(seed)
+    fold_of_row = np.repeat(_folds(len(lengths), k, rng), lengths + 1)
+    fold_of_example = _folds(n_examples, k, rng)
+    row_logits, example_logits = (np.empty(n, np.float32) for n in (len(fold_of_row), n_examples))
+    for fold in range(k):
+        unseen_rows, unseen_examples = (np.flatnonzero(of == fold) for of in (fold_of_row, fold_of_example))
+        seen_rows, seen_examples = (np.flatnonzero(of != fold) for of in (fold_of_row, fold_of_example))
+        if k == 1:
+            seen_rows, seen_examples = unseen_rows, unseen_examples
+        model = _train(buffer, seen_rows, arrays, seen_examples, settings, make_encoder, rng)
+        row_logits[unseen_rows] = _logits(model, buffer.observations_at, unseen_rows)
+        example_logits[unseen_examples] = _logits(model, lambda rows: _batch(arrays, rows, buffer), unseen_examples)
+    calibration = calibrate(example_logits, row_logits)
+    return StepProbabilities(calibration(row_logits), lengths, calibration)
+
+
+def _folds(n: int, k: int, rng: np.random.Generator) -> np.ndarray:
+    """:return: (n,) the share of each of n things, all of nearly equal size"""
+    return rng.permutation(np.arange(n) % k)
+
+
+def _columns(examples: Observations) -> dict[str, np.ndarray]:
+    """:return: the examples by key ("" without a dict); those of a discrete space become columns, as in the buffer"""
+    arrays = examples if isinstance(examples, dict) else {"": examples}
+    return {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
+
+
+def _batch(arrays: dict[str, np.ndarray], rows: np.ndarray, buffer: OfflineReplayBuffer) -> PyTorchObs:
+    batch = {key: th.as_tensor(array[rows], device=buffer.device) for key, array in arrays.items()}
+    return batch if isinstance(buffer.observation_space, spaces.Dict) else batch[""]
+
+
+def _train(
+    buffer: OfflineReplayBuffer,
+    rows: np.ndarray,
+    arrays: dict[str, np.ndarray],
+    example_rows: np.ndarray,
+    settings: ClassifierSettings,
+    make_encoder: EncoderFactory | None,
+    rng: np.random.Generator,
+) -> StateClassifier:
+    """:return: a classifier, trained on these rows of the data and of the examples"""
+    space = buffer.observation_space
+    gradient_steps = settings.gradient_steps or (IMAGE_STEPS if has_images(space) else VECTOR_STEPS)
+    with th.random.fork_rng(devices=[buffer.device] if buffer.device.type == "cuda" else []):
+        th.manual_seed(int(rng.integers(2**31)))
+        encoder = make_encoder() if make_encoder is not None else _default_encoder(space)
+        model = StateClassifier(space, buffer.action_space, encoder, list(settings.net_arch)).to(buffer.device)
+    fit_statistics(model, buffer.observation_statistics)
+    model.set_training_mode(True)
+    optimizer = th.optim.Adam(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
+    with th.enable_grad():
+        for _ in range(gradient_steps):
+            data = buffer.observations_at(rng.choice(rows, settings.batch_size))
+            drawn = example_rows[rng.integers(len(example_rows), size=settings.batch_size)]
+            shown = _batch(arrays, drawn, buffer)
+            data, shown = (shift_observations(part, space, settings.max_shift, rng) for part in (data, shown))
+            loss = positive_unlabelled_loss(model(shown), model(data), settings.positive_share)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+    model.set_training_mode(False)
+    return model
+
+
+def _default_encoder(space: spaces.Space) -> BaseFeaturesExtractor:
+    if isinstance(space, spaces.Dict):
+        return StandardizedCombinedExtractor(space)
+    return NormalizedNatureCNN(space) if is_image_space(space) else StandardizedExtractor(space)  # type: ignore[arg-type]
+
+
+@th.no_grad()
+def _logits(model: StateClassifier, read: Callable[[np.ndarray], PyTorchObs], rows: np.ndarray) -> np.ndarray:
+    """:return: (n,) float32, the logits of these observations"""
+    pieces = [rows[first : first + SCORED_AT_ONCE] for first in range(0, len(rows), SCORED_AT_ONCE)]
+    return np.concatenate([model(read(piece)).float().cpu().numpy() for piece in pieces])
