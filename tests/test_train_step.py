@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-from functools import partial
 
 import numpy as np
 import pytest
@@ -13,10 +12,13 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_offline import BC, CEBORL, RCE
-from sb3_offline.ceborl import PAPER_FORM
+from sb3_offline.ceborl import PAPER_FORM, backups
 from sb3_offline.ceborl.resampling import WeightedTransitions
 from sb3_offline.common.augmentation import GROUP_SIZE, random_shift
 from sb3_offline.common.stub_env import SpacesOnlyEnv
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.labelling.calibration import Calibration
+from sb3_offline.labelling.classifier import StepProbabilities
 
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -77,8 +79,8 @@ def recursive(f, weight):
     return (weight * softplus(-f) + softplus(f)).mean(axis=-1).sum()
 
 
-@pytest.mark.parametrize("advantage", ["return", "value"])
-def test_default_form(dataset, monkeypatch, advantage):
+@pytest.mark.parametrize("advantage", ["return", "value", "mean"])
+def test_in_sample_form(dataset, monkeypatch, advantage):
     n_steps, beta, prior, share, temperature, floor, weight_max, exponent = 3, 0.2, 0.5, 0.1, 0.5, 0.05, 1.2, 0.7
     model = CEBORL(
         "MlpPolicy",
@@ -88,11 +90,9 @@ def test_default_form(dataset, monkeypatch, advantage):
         gamma=GAMMA,
         n_steps=n_steps,
         beta=beta,
-        class_prior=prior,
         example_share=share,
+        backup="dataset",
         temperature=temperature,
-        advantage_floor=floor,
-        weight_max=weight_max,
         state_exponent=exponent,
         advantage=advantage,
         initial_odds=0.5,
@@ -100,6 +100,7 @@ def test_default_form(dataset, monkeypatch, advantage):
         seed=0,
         policy_kwargs=SMALL,
     )
+    model.class_prior, model._extraction.advantage_floor, model._extraction.weight_max = prior, floor, weight_max
     reading = Reading(model, monkeypatch)
     batch, examples, target = reading.batch, reading.examples, model.critic_target
     one, many = (np.exp(reading.logits(target, h.observations, h.next_actions).min(axis=0)) for h in batch.horizons)
@@ -118,7 +119,8 @@ def test_default_form(dataset, monkeypatch, advantage):
     state += share * recursive(v_examples, example_weight)
 
     eps = floor * np.exp(f_examples.min(axis=0)).mean()
-    odds = weight if advantage == "return" else np.exp(f.min(axis=0))
+    of_actions = np.exp(f.min(axis=0))
+    odds = {"return": weight, "value": of_actions, "mean": np.sqrt(weight * of_actions)}[advantage]
     weights = ((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
     weights = np.minimum(weights, weight_max) * (np.exp(v) / (np.exp(v) + eps)) ** exponent
@@ -133,18 +135,51 @@ def test_default_form(dataset, monkeypatch, advantage):
 
     critic_loss, actor_loss = reading.train()
     assert critic_loss == pytest.approx(beta * a + b + recursive(f, weight) + state, rel=1e-5)
-    np.testing.assert_allclose(model._extraction.pool.weights[-1], weights, rtol=1e-4)
-    np.testing.assert_array_equal(model._extraction.pool.indices[-1], batch.indices)
+    last = {int(index): weight for index, weight in zip(batch.indices, weights, strict=True)}  # a batch may hold one twice
+    np.testing.assert_allclose(model._extraction.pool.weights[list(last)], list(last.values()), rtol=1e-4)
     assert actor_loss == pytest.approx(regression.mean(), rel=1e-3)
 
 
-def test_transitions_are_drawn_by_weight_from_the_last_batches():
+def test_episode_form(dataset, monkeypatch):
+    """The default: omega is the best discounted detection in the rest of the episode, and nothing is bootstrapped."""
+    beta, temperature, lengths = 0.2, 0.5, OfflineDataset(dataset / "states.h5").lengths
+    detected = StepProbabilities(np.random.default_rng(1).random(lengths.sum() + len(lengths)), lengths, Calibration(1, 0, 0))
+    monkeypatch.setattr(backups, "success_probabilities", lambda *_, **__: detected)
+    kwargs = {"gamma": GAMMA, "beta": beta, "temperature": temperature, "n_action_samples": 5, "example_share": 0.0}
+    model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, policy_kwargs=SMALL, **kwargs)
+    reading = Reading(model, monkeypatch)
+    batch, examples = model.replay_buffer.sample_pairs(64), reading.examples
+    monkeypatch.setattr(model._backup, "sample", lambda _: batch)
+    weight = np.empty(model.replay_buffer.size())
+    for start, length in zip(np.cumsum(lengths) - lengths, lengths, strict=True):
+        for t in range(start, start + length):
+            weight[t] = GAMMA * max(GAMMA ** (k - t) * detected.after[k] for k in range(t, start + length))
+    weight = weight[batch.indices]
+    assert 0 < weight.min() < weight.max() <= GAMMA
+
+    f = reading.logits(model.critic, batch.observations, batch.actions)
+    f_examples = reading.logits(model.critic, examples, reading.mode(examples))
+    f_penalized = reading.logits(model.critic, batch.observations, reading.penalized)
+    with th.no_grad():
+        v = model.critic.state_values(model.critic.encode(batch.observations)).double().numpy()
+    a = (np.log(np.exp(sigmoid(f_penalized)).mean(axis=-1)) - sigmoid(f)).mean(axis=-1).sum()
+    b = (1 - GAMMA) * softplus(-f_examples).mean(axis=-1).sum()
+    eps = 0.01 * GAMMA
+    odds = np.sqrt(weight * np.exp(f.min(axis=0)))
+    weights = np.minimum(((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature), 100.0)
+    weights *= (np.exp(v) / (np.exp(v) + eps)) ** 2
+    critic_loss, _ = reading.train()
+    assert critic_loss == pytest.approx(beta * a + b + recursive(f, weight) + recursive(v, weight), rel=1e-4)
+    np.testing.assert_allclose(model._extraction.pool.weights[batch.indices], weights, rtol=1e-3)
+
+
+def test_transitions_are_drawn_by_their_last_weights():
     th.manual_seed(0)
-    kept = WeightedTransitions(2)
-    for first in (0, 10, 20):
-        kept.add(th.arange(first, first + 2), th.tensor([1.0, 3.0]))
+    kept = WeightedTransitions(30)
+    for first, weights in ((0, [9.0, 9.0]), (0, [1.0, 3.0]), (20, [1.0, 3.0])):
+        kept.add(th.arange(first, first + 2), th.tensor(weights))
     indices, counts = np.unique(kept.draw(8000), return_counts=True)
-    np.testing.assert_array_equal(indices, [10, 11, 20, 21])
+    np.testing.assert_array_equal(indices, [0, 1, 20, 21])
     np.testing.assert_allclose(counts / 8000, [0.125, 0.375, 0.125, 0.375], atol=0.03)
     assert kept.effective_share().item() == pytest.approx(0.8)
 
@@ -152,12 +187,12 @@ def test_transitions_are_drawn_by_weight_from_the_last_batches():
 def test_with_another_dataset_no_transitions_of_the_old_one_are_drawn(dataset, tmp_path):
     write_dataset(tmp_path / "small.h5", 2, STATES)
     model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, batch_size=64, policy_kwargs=SMALL).learn(3)
-    kept = model._extraction.pool.indices
+    kept = model._extraction.pool.weights.clone()
     model.learn(1)
-    assert model._extraction.pool.indices.shape == (4, 64) and th.equal(model._extraction.pool.indices[:3], kept)
+    assert len(kept) == model.replay_buffer.size() and (model._extraction.pool.weights[kept > 0] > 0).all()
     model.dataset = tmp_path / "small.h5"
     model.learn(1)
-    assert model._extraction.pool.indices.max() < model.replay_buffer.size() and len(model._extraction.pool.indices) == 1
+    assert len(model._extraction.pool.weights) == model.replay_buffer.size() < len(kept)
 
 
 @pytest.mark.parametrize("n_steps", [1, 10])
@@ -187,7 +222,7 @@ def test_paper_form(dataset, monkeypatch, n_steps):
 def test_the_paper_form_names_every_setting():
     """A preset that leaves a setting out would change with the constructor's default."""
     about_the_run = {"policy", "env", "dataset", "examples", "dataset_storage", "stats_window_size", "tensorboard_log"}
-    about_the_run |= {"self", "verbose", "seed", "device", "_init_setup_model"}
+    about_the_run |= {"self", "kwargs", "verbose", "seed", "device", "_init_setup_model"}
     assert PAPER_FORM.keys() == inspect.signature(CEBORL.__init__).parameters.keys() - about_the_run
 
 
@@ -315,32 +350,13 @@ def test_every_batch_of_images_is_shifted(dataset, monkeypatch):
     examples = make_observations(IMAGES, 4, np.random.default_rng(0))
     kwargs = {**SMALL, "features_extractor_kwargs": {"features_dim": 16}}
     kwargs = {"batch_size": 8, "example_batch_size": 4, "random_shift": 4, "policy_kwargs": kwargs}
-    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, **kwargs)
+    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, backup="dataset", **kwargs)
     sizes, augment = [], model.augment
     monkeypatch.setattr(model, "augment", lambda batch, *shift: sizes.append(len(batch)) or augment(batch, *shift))
     model.learn(1)
     assert sorted(sizes)[1:] == [8] * 4 and min(sizes) <= 4  # the examples drawn; s, s', the n-step state, the policy's batch
     batch = model.replay_buffer.sample(8).observations
     assert not th.equal(augment(batch), batch)
-
-
-def test_the_policys_images_may_be_shifted_alone(dataset, monkeypatch):
-    examples = make_observations(IMAGES, 4, np.random.default_rng(0))
-    kwargs = {"batch_size": 8, "example_batch_size": 4, "policy_kwargs": {**SMALL, "share_features_extractor": False}}
-    model = CEBORL("CnnPolicy", None, dataset / "images.h5", examples, seed=0, policy_random_shift=4, **kwargs)
-    encoded = {}
-    for name, module in (("policy", model.actor), ("critic", model.critic), ("target", model.critic_target)):
-        monkeypatch.setattr(module, "encode", partial(_encoded, encoded.setdefault(name, []), module.encode))
-    model.learn(1)
-    stored = {image.numpy().tobytes() for image in model.replay_buffer.pairs(np.arange(model.replay_buffer.size()))[0]}
-    stored |= {image.tobytes() for image in model.all_examples().numpy()}
-    known = {name: [image.numpy().tobytes() in stored for image in th.cat(batches)] for name, batches in encoded.items()}
-    assert all(known["critic"]) and not all(known["policy"])
-
-
-def _encoded(batches, encode, observations):
-    batches.append(observations)
-    return encode(observations)
 
 
 @pytest.mark.parametrize("max_shift", [0, 3])

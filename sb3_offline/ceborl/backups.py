@@ -19,10 +19,11 @@ from sb3_offline.ceborl.losses import (
     recursive_loss,
     success_odds,
 )
+from sb3_offline.common.augmentation import has_images
 from sb3_offline.common.losses import expectile_loss
 from sb3_offline.data.buffer import Horizon, OfflineReplayBuffer, OfflineSamples, Pairs, joined
-from sb3_offline.data.examples import examples_checksum
-from sb3_offline.labelling.classifier import success_probabilities
+from sb3_offline.data.examples import Observations, examples_checksum
+from sb3_offline.labelling.classifier import ClassifierSettings, success_probabilities
 
 
 class Learner(Protocol):
@@ -197,7 +198,7 @@ class EpisodeBackup(Backup):
         examples = model.read_examples()
         made_of = (buffer.checksum(), examples_checksum(examples))
         if made_of != self.made_of:
-            success = success_probabilities(buffer, examples, seed=model.seed or 0)
+            success = success_probabilities(buffer, examples, _detector(buffer, examples), seed=model.seed or 0)
             outcomes = model.gamma * episode_outcomes(success.after, success.lengths, model.gamma)
             self.outcomes, self.made_of = th.as_tensor(outcomes), made_of
         assert self.outcomes is not None
@@ -227,6 +228,13 @@ class EpisodeBackup(Backup):
     ) -> tuple[th.Tensor, th.Tensor]:
         state_logits = self.model.critic.state_values(features)
         return state_logits, recursive_loss(state_logits.unsqueeze(0), discounted_omega)
+
+
+def _detector(buffer: OfflineReplayBuffer, examples: Observations) -> ClassifierSettings:
+    """:return: how to train the classifier of states: less long from images, where a network takes minutes"""
+    n_examples = len(next(iter(examples.values())) if isinstance(examples, dict) else examples)
+    settings = ClassifierSettings(n_models=min(2, n_examples, len(buffer.lengths)))
+    return settings._replace(gradient_steps=300, batch_size=128) if has_images(buffer.observation_space) else settings
 
 
 #: By the names that ``backup`` takes.

@@ -152,8 +152,8 @@ def success_probabilities(
     n_examples = len(next(iter(arrays.values())))
     k = settings.n_models
     for field, n in (("episodes", len(lengths)), ("examples", n_examples)):
-        if n < max(k, 2):
-            problem = f"are {n}, but the classifier needs {max(k, 2)} at least, to be judged on those that it has not seen"
+        if n < k:
+            problem = f"are {n}, but the classifier needs {k} at least, to be judged on those that it has not seen"
             raise DatasetError(buffer.datasets[0].path, field, problem, f"Give more {field}")
     rng = np.random.default_rng(seed)
     fold_of_row = np.repeat(_folds(len(lengths), k, rng), lengths + 1)
