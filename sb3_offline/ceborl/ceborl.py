@@ -14,6 +14,7 @@ from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.ceborl.diagnostics import DiagnosticsCallback
 from sb3_offline.ceborl.extraction import ADVANTAGES, EXTRACTIONS, PolicyExtraction
 from sb3_offline.ceborl.losses import conservative_penalty
+from sb3_offline.common.augmentation import has_images
 from sb3_offline.common.example_based import ExamplesLike
 from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, Constraints, Options
 from sb3_offline.common.search import SearchSpace, Uniform, log_uniform
@@ -45,6 +46,9 @@ PAPER_FORM: dict[str, Any] = {
     "random_shift": 0,
     "policy_kwargs": {"share_features_extractor": False, "std_transform": "softplus"},
 }
+
+#: Default of ``random_shift`` for images
+RANDOM_SHIFT = 4
 
 
 class CEBORL(RecursiveClassifier):
@@ -95,7 +99,8 @@ class CEBORL(RecursiveClassifier):
         better in a state, but most states of a mixed dataset lead nowhere, and their best action matters little
     :param ent_coef: Entropy coefficient of ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
-    :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
+    :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation; default: 4
+        where there are images)
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
@@ -132,8 +137,8 @@ class CEBORL(RecursiveClassifier):
         dataset: DatasetLike | None = None,
         examples: ExamplesLike | None = None,
         learning_rate: float | Schedule = 3e-4,
-        batch_size: int = 256,
-        example_batch_size: int = 256,
+        batch_size: int = 128,
+        example_batch_size: int = 32,
         tau: float = 0.02,
         gamma: float = 0.97,
         n_steps: int = 10,
@@ -150,7 +155,7 @@ class CEBORL(RecursiveClassifier):
         state_exponent: float = 2.0,
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
-        random_shift: int = 0,
+        random_shift: int | None = None,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -174,7 +179,7 @@ class CEBORL(RecursiveClassifier):
             gamma=gamma,
             n_steps=n_steps,
             target_update_interval=target_update_interval,
-            random_shift=random_shift,
+            random_shift=random_shift,  # type: ignore[arg-type]
             policy_kwargs=policy_kwargs,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -199,6 +204,8 @@ class CEBORL(RecursiveClassifier):
         return BACKUPS[self.backup](self), EXTRACTIONS[self.policy_extraction](self)
 
     def _setup_model(self) -> None:
+        if self.random_shift is None and hasattr(self, "observation_space"):
+            self.random_shift = RANDOM_SHIFT if has_images(self.observation_space) else 0
         super()._setup_model()
         if self.mu == "mixture" and self.n_action_samples == 1:
             raise TypeError(f"{type(self).__name__}: mu='mixture' takes half of the actions each; give n_action_samples >= 2")

@@ -94,9 +94,7 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         own: dict[str, Any] = {"critic_output_bias": math.log(self.initial_odds)}
         if self._extraction.needs_state_head or self._backup.fits_state_head:
             own["critic_state_value"] = True
-        if self._extraction.std_min is not None:
-            own["std_min"] = self._extraction.std_min
-        return {**own, **self.policy_kwargs}
+        return {**own, **self._extraction.policy_kwargs(), **self.policy_kwargs}
 
     def _open_data(self) -> None:
         super()._open_data()

@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_offline.ceborl.losses import OVERFLOW, odds_ratio_weights, success_odds
 from sb3_offline.ceborl.resampling import WeightedTransitions
+from sb3_offline.common.augmentation import has_images
 
 
 class CriticStep(NamedTuple):
@@ -53,6 +54,7 @@ class Learner(Protocol):
     """What extractions ask of their model: networks, data, and the constructor's arguments, which may change in training."""
 
     actor: Any
+    observation_space: Any
     replay_buffer: Any
     augment: Any
     ent_coef: float
@@ -68,7 +70,6 @@ class WeightingLearner(Learner, Protocol):
     advantage: str
     temperature: float
     state_exponent: float
-    policy_random_shift: int | None
 
 
 class PolicyExtraction:
@@ -80,13 +81,13 @@ class PolicyExtraction:
 
     #: whether the critic has a head of states without an action
     needs_state_head: ClassVar[bool] = False
-    #: whether the policy imitates observations of its own, which may be shifted otherwise than the critic's
-    imitates: ClassVar[bool] = False
-    #: floor of the policy's standard deviation before the tanh; ``None`` for the policy's own default
-    std_min: ClassVar[float | None] = None
 
     def __init__(self, model: Any):
         self.model = model
+
+    def policy_kwargs(self) -> dict[str, Any]:
+        """:return: arguments of the policy that suit this extraction, where the user says nothing"""
+        return {}
 
     def actor_loss(self, step: CriticStep) -> th.Tensor:
         """
@@ -129,8 +130,6 @@ class WeightedRegression(PolicyExtraction):
     """
 
     needs_state_head = True
-    imitates = True
-    std_min = 0.05
     #: odds, as a share of the odds of success, below which advantages are noise and count little
     advantage_floor: float = 0.01
     #: upper bound of the advantage weights
@@ -141,6 +140,12 @@ class WeightedRegression(PolicyExtraction):
         super().__init__(model)
         self.pool = WeightedTransitions(0)
         self.checksum: int | None = None  # of the dataset that the weights belong to
+
+    def policy_kwargs(self) -> dict[str, Any]:
+        # The policy imitates few transitions, which it would learn by heart. It has an encoder of its own for images, because
+        # features that tell success apart need not tell which action is good
+        own_encoder = has_images(self.model.observation_space)
+        return {"std_min": 0.05, "actor_dropout": 0.2, "share_features_extractor": not own_encoder}
 
     def get_state(self) -> Any:
         return self.pool, self.checksum

@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algo", default="ceborl", help=f"one of {', '.join(ALGOS)} (default: ceborl)")
     parser.add_argument("--env", default=ENV_ID, help=f"id of the environment to evaluate in (default: {ENV_ID})")
     parser.add_argument("--task", help="task of the multimodal environment, e.g. door-open")
+    parser.add_argument("--table", help="table of the multimodal environment: paper (default) or second")
     parser.add_argument("--config", help="name of a shipped config, or a YAML file (default: the algorithm's config)")
     parser.add_argument("--dataset", nargs="+", help="dataset files or patterns (default: those of the config)")
     parser.add_argument("--examples", help="folder of images, .npz, .npy or HDF5 file (default: the config's)")
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> None:
         args.output,
         dataset=args.dataset[0] if args.dataset and len(args.dataset) == 1 else args.dataset,
         examples=args.examples,
-        env_kwargs={"task": args.task} if args.task else {},
+        env_kwargs={name: value for name in ("task", "table") if (value := getattr(args, name)) is not None},
         seed=args.seed,
         eval_freq=args.eval_freq,
         n_eval_episodes=args.eval_episodes,
