@@ -90,7 +90,7 @@ def test_command_line_from_data_to_evaluation(demo, tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"typo\.h5"):
         cli.main([*train, "--eval-freq", "1", "-o", run])
     train[train.index("typo.h5")] = str(tmp_path / "examples.h5")
-    for wrong, message in ((["--env", "Pendulum-v1"], "do not fit"), (["--hyperparams", "weight_max:0"], "weight_max is 0")):
+    for wrong, message in ((["--env", "Pendulum-v1"], "do not fit"), (["--hyperparams", "temperature:0"], "temperature is 0")):
         with pytest.raises(SystemExit, match=message):
             cli.main([*train, "--eval-freq", "1", "-o", run, *wrong])
     assert files() == before  # a run stays until the data, the settings and the environment of the next one have been checked

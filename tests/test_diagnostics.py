@@ -61,8 +61,8 @@ def test_a_domain_gap_is_told(dataset):
 
 def test_weights_that_are_too_sharp_are_told(dataset, monkeypatch):
     monkeypatch.setattr(WeightedRegression, "weight_max", 1e17)
-    _, messages = learn(dataset, 100, DiagnosticsCallback(check_freq=20), temperature=0.02, learning_rate=3e-3)
-    assert len(messages) == 1 and "Raise temperature (now 0.02)" in messages[0]
+    _, messages = learn(dataset, 100, DiagnosticsCallback(check_freq=20), temperature=0.005, backup="dataset")
+    assert len(messages) == 1 and "Raise temperature (now 0.005)" in messages[0]
 
 
 def test_what_is_measured_is_logged(dataset, tmp_path):

@@ -16,7 +16,7 @@ from sb3_offline.ceborl.extraction import ADVANTAGES, EXTRACTIONS, PolicyExtract
 from sb3_offline.ceborl.losses import conservative_penalty
 from sb3_offline.common.augmentation import has_images
 from sb3_offline.common.example_based import ExamplesLike
-from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, Constraints, Options
+from sb3_offline.common.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, WHOLE, Constraints, Options
 from sb3_offline.common.search import SearchSpace, Uniform, log_uniform
 from sb3_offline.data.reader import DatasetLike
 
@@ -120,6 +120,7 @@ class CEBORL(RecursiveClassifier):
         "policy_extraction": [Options(tuple(EXTRACTIONS))],
         "advantage": [Options(tuple(ADVANTAGES))],
         "temperature": [POSITIVE],
+        "random_shift": [WHOLE, None],
         "state_exponent": [NOT_NEGATIVE],
     }
     search_space: ClassVar[SearchSpace] = {
