@@ -3,6 +3,7 @@
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,17 @@ def load_examples(
     if isinstance(observation_space, spaces.Dict):
         return {name.removeprefix("examples/"): array for name, array in arrays.items()}
     return arrays["examples"]
+
+
+def examples_checksum(examples: Observations) -> int:
+    """
+    :param examples: examples as :func:`load_examples` returns them
+    :return: a checksum, an identifier of the examples
+    """
+    checksum = 0
+    for array in examples.values() if isinstance(examples, dict) else [examples]:
+        checksum = zlib.crc32(array.tobytes(), checksum)
+    return checksum
 
 
 def save_examples(
