@@ -5,10 +5,12 @@ import pytest
 import torch as th
 from point_mass import ACTIONS, GOALS, RADIUS, STATES, goal_examples, write_point_mass
 
+from sb3_offline import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.selection import select_episodes
+from sb3_offline.experiment.training import create_model
 from sb3_offline.labelling import (
     ClassifierSettings,
     EpisodeLabels,
@@ -196,3 +198,30 @@ def test_detected_episodes_are_selected(data, labels, tmp_path, monkeypatch):
         select_detected(data, labels=path, examples=goal_examples(seed=2))
     with pytest.raises(RuntimeError, match="need `labels`"):
         select_detected(data)
+
+
+def test_configs_learn_from_detected_episodes_and_steps(data, labels, tmp_path):
+    """Of a config, BC gets the detected episodes and no examples, and CQL a reward for each detected step."""
+    file = tmp_path / "labels.h5"
+    save_labels(file, labels)
+    config = {"policy": "MlpPolicy", "dataset": str(data), "labels": str(file), "policy_kwargs": {"net_arch": [8]}}
+    model = create_model("bc", {**config, "examples": goal_examples(), "episodes": {"detected": True}}, device="cpu")
+    assert model.replay_buffer.size() == labels.lengths[labels.detected].sum()
+    model = create_model("cql", {**config, "reward_fn": "detected"}, device="cpu")
+    np.testing.assert_array_equal(model.replay_buffer.rewards, labels.success)
+    for episodes in ({"detected": True, "source": "a"}, {"detected": 0}, {"detected": "yes"}):
+        with pytest.raises(RuntimeError, match="give `detected` alone"):
+            create_model("bc", {**config, "episodes": episodes})
+    with pytest.raises(RuntimeError, match="need `labels`"):
+        create_model("cql", {"policy": "MlpPolicy", "dataset": str(data), "reward_fn": "detected"})
+
+
+def test_labels_are_rewards_of_their_own_data_alone(data, labels, tmp_path):
+    model = CQL("MlpPolicy", None, dataset=str(data), reward_fn=labels, policy_kwargs={"net_arch": [8]}, device="cpu")
+    np.testing.assert_array_equal(model.replay_buffer.rewards, labels.success)
+    write_point_mass(tmp_path / "other.h5", n_episodes=5)
+    other = CQL("MlpPolicy", None, dataset=str(tmp_path / "other.h5"), reward_fn=labels, device="cpu")
+    with pytest.raises(DatasetError, match="episodes of other data than"):
+        other.learn(1)
+    with pytest.raises(TypeError, match=r"label_episodes\(dataset, examples\)"):
+        CQL("MlpPolicy", None, dataset=str(data), reward_fn="detected")
