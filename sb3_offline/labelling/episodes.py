@@ -266,3 +266,24 @@ def check_labels(labels: EpisodeLabels, solved: np.ndarray) -> LabelCheck:
         recall=float(detected[solved].mean()) if n else float("nan"),
         successes=n,
     )
+
+
+def solved_episodes(datasets: Sequence[OfflineDataset], array: str = "success") -> np.ndarray:
+    """
+    :param datasets: open datasets
+    :param array: name of labels of steps, ``success`` or an array such as ``extras/task_success``; of several columns, one is
+        chosen as in ``extras/task_success:2``
+    :return: (E,) bool, true for the episodes with such a step
+    :raises DatasetError: if there are no such labels
+    """
+    name, _, column = array.partition(":")
+    solved = []
+    for part in datasets:
+        found = part.arrays.get(name)
+        if found is None or (len(found.shape) > 1) != column.isdigit() or (column and int(column) >= found.shape[1]):
+            shape = "is missing" if found is None else f"has rows of shape {found.shape[1:]}"
+            remedy = "Name labels of steps that the file has, as in success or extras/task_success:2"
+            raise DatasetError(part.path, array, shape, remedy)
+        steps = np.asarray(found[:], dtype=bool)
+        solved.append(np.logical_or.reduceat(steps[:, int(column)] if column else steps, part.step_starts))
+    return np.concatenate(solved)
