@@ -16,6 +16,7 @@ from sb3_offline.data.reader import OfflineDataset as OfflineDataset
 from sb3_offline.data.writer import DatasetWriter as DatasetWriter
 from sb3_offline.dcql import DCQL as DCQL
 from sb3_offline.iql import IQL as IQL
+from sb3_offline.labelling.episodes import label_episodes as label_episodes
 from sb3_offline.oril import ORIL as ORIL
 from sb3_offline.rce import RCE as RCE
 from sb3_offline.rebrac import ReBRAC as ReBRAC

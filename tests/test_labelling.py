@@ -5,10 +5,25 @@ import pytest
 import torch as th
 from point_mass import ACTIONS, GOALS, RADIUS, STATES, goal_examples, write_point_mass
 
+from sb3_offline import CQL
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data.selection import select_episodes
+from sb3_offline.experiment.training import create_model
+from sb3_offline.labelling import (
+    ClassifierSettings,
+    EpisodeLabels,
+    Estimate,
+    check_labels,
+    label_episodes,
+    load_labels,
+    save_labels,
+    select_detected,
+    success_probabilities,
+    write_labelled_copy,
+)
 from sb3_offline.labelling.calibration import calibrate
-from sb3_offline.labelling.classifier import ClassifierSettings, success_probabilities
 from sb3_offline.labelling.losses import positive_unlabelled_loss
 
 SETTINGS = ClassifierSettings(gradient_steps=150, batch_size=128)
@@ -97,3 +112,116 @@ def test_probabilities_are_calibrated_without_labels():
     for low, high in ((0, 0.2), (0.2, 0.8), (0.8, 1)):
         inside = (probabilities >= low) & (probabilities <= high)
         assert probabilities[inside].mean() == pytest.approx(success[inside].mean(), abs=0.1)
+
+
+@pytest.fixture(scope="module")
+def labels(data):
+    return label_episodes(str(data), goal_examples(), settings=SETTINGS, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def solved(data):
+    dataset = OfflineDataset(data)
+    inside = near_goal(np.asarray(dataset.observations))
+    return np.array(
+        [inside[s + 1 : s + n + 1].any() for s, n in zip(dataset.observation_starts, dataset.lengths, strict=True)]
+    )
+
+
+def test_episodes_are_judged_and_counted_without_labels(data, labels, solved):
+    check = check_labels(labels, solved)
+    assert check.auc > 0.99 and check.precision > 0.9 and check.recall > 0.85 and check.successes == solved.sum()
+    precision, successes = labels.estimated_precision, labels.estimated_successes
+    assert precision.low <= precision.value <= precision.high and precision.value > 0.85
+    assert successes.low <= successes.value <= successes.high and successes.value == pytest.approx(solved.sum(), rel=0.2)
+    assert labels.best(7).sum() == 7 and labels.scores[labels.best(7)].min() >= labels.scores[~labels.best(7)].max()
+    by_episode = np.logical_or.reduceat(labels.success, OfflineDataset(data).step_starts)
+    np.testing.assert_array_equal(by_episode, labels.detected)
+    assert not labels.warnings
+
+
+def test_examples_unlike_the_data_are_doubted(data):
+    few = ClassifierSettings(gradient_steps=2)
+    doubted = label_episodes(str(data), goal_examples() + np.float32(1.0), settings=few, device="cpu")
+    assert any("50 of 50 are unlike every observation of the data" in warning for warning in doubted.warnings)
+
+
+def test_the_check_counts_ties_by_half():
+    def check(ranking, solved):
+        n = len(ranking)
+        nothing = Estimate(0, 0, 0)
+        labels = EpisodeLabels(np.zeros(n), np.ones(n, int), np.array(ranking), np.array(ranking), nothing, nothing, 0)
+        return check_labels(labels, np.array(solved, bool))
+
+    assert check([0.9, 0.6, 0.4, 0.1], [1, 0, 1, 0]) == (0.75, 0.5, 0.5, 2)
+    assert check([0.5, 0.5], [1, 0]).auc == 0.5
+
+
+def test_labels_return_from_their_file_and_belong_to_their_data(data, labels, tmp_path):
+    path = tmp_path / "labels.h5"
+    save_labels(path, labels, {"examples": "goal"})
+    again = load_labels(path, [OfflineDataset(data)])
+    for name in ("probabilities", "lengths", "ranking", "scores", "success", "detected"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(labels, name))
+    for name in ("estimated_precision", "estimated_successes", "checksum", "made_with"):
+        assert getattr(again, name) == getattr(labels, name)
+    with pytest.raises(DatasetError, match="exists already"):
+        save_labels(path, labels, overwrite=False)
+    write_point_mass(tmp_path / "other.h5", n_episodes=240, seed=1)
+    with pytest.raises(DatasetError, match=r"labels.h5.*hold 240 episodes of other data than .*other.h5"):
+        load_labels(path, [OfflineDataset(tmp_path / "other.h5")])
+    with pytest.raises(DatasetError, match="expected 'sb3-offline-labels'"):
+        load_labels(data)
+
+
+def test_a_labelled_copy_has_the_labels_as_its_success(data, labels, tmp_path):
+    write_labelled_copy(tmp_path / "copy.h5", OfflineDataset(data), labels)
+    copy, original = OfflineDataset(tmp_path / "copy.h5"), OfflineDataset(data)
+    np.testing.assert_array_equal(copy.success, labels.success)
+    for name in ("observations", "actions", "lengths", "seeds", "truncated"):
+        np.testing.assert_array_equal(getattr(copy, name), getattr(original, name))
+    assert sum(part.n_episodes for part in select_episodes(copy, success=True)) == labels.detected.sum()
+    assert copy.provenance["labelled"]["seed"] == 0
+
+
+def test_detected_episodes_are_selected(data, labels, tmp_path, monkeypatch):
+    path = tmp_path / "labels.h5"
+    calls = []
+    monkeypatch.setattr("sb3_offline.labelling.selection.label_episodes", lambda *args, **kwargs: calls.append(1) or labels)
+    for _ in range(2):  # made once
+        (chosen,) = select_detected(data, labels=path, examples=goal_examples())
+        np.testing.assert_array_equal(chosen.seeds, OfflineDataset(data).seeds[labels.detected])
+    assert len(calls) == 1
+    (best,) = select_detected(data, 5, labels=labels)
+    np.testing.assert_array_equal(best.seeds, OfflineDataset(data).seeds[labels.best(5)])
+    with pytest.raises(DatasetError, match="were made from other examples"):
+        select_detected(data, labels=path, examples=goal_examples(seed=2))
+    with pytest.raises(RuntimeError, match="need `labels`"):
+        select_detected(data)
+
+
+def test_configs_learn_from_detected_episodes_and_steps(data, labels, tmp_path):
+    """Of a config, BC gets the detected episodes and no examples, and CQL a reward for each detected step."""
+    file = tmp_path / "labels.h5"
+    save_labels(file, labels)
+    config = {"policy": "MlpPolicy", "dataset": str(data), "labels": str(file), "policy_kwargs": {"net_arch": [8]}}
+    model = create_model("bc", {**config, "examples": goal_examples(), "episodes": {"detected": True}}, device="cpu")
+    assert model.replay_buffer.size() == labels.lengths[labels.detected].sum()
+    model = create_model("cql", {**config, "reward_fn": "detected"}, device="cpu")
+    np.testing.assert_array_equal(model.replay_buffer.rewards, labels.success)
+    for episodes in ({"detected": True, "source": "a"}, {"detected": 0}, {"detected": "yes"}):
+        with pytest.raises(RuntimeError, match="give `detected` alone"):
+            create_model("bc", {**config, "episodes": episodes})
+    with pytest.raises(RuntimeError, match="need `labels`"):
+        create_model("cql", {"policy": "MlpPolicy", "dataset": str(data), "reward_fn": "detected"})
+
+
+def test_labels_are_rewards_of_their_own_data_alone(data, labels, tmp_path):
+    model = CQL("MlpPolicy", None, dataset=str(data), reward_fn=labels, policy_kwargs={"net_arch": [8]}, device="cpu")
+    np.testing.assert_array_equal(model.replay_buffer.rewards, labels.success)
+    write_point_mass(tmp_path / "other.h5", n_episodes=5)
+    other = CQL("MlpPolicy", None, dataset=str(tmp_path / "other.h5"), reward_fn=labels, device="cpu")
+    with pytest.raises(DatasetError, match="episodes of other data than"):
+        other.learn(1)
+    with pytest.raises(TypeError, match=r"label_episodes\(dataset, examples\)"):
+        CQL("MlpPolicy", None, dataset=str(data), reward_fn="detected")

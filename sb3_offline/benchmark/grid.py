@@ -5,12 +5,12 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.experiment.config import load_config, read_yaml
+from sb3_offline.experiment.data import uses_labels
 from sb3_offline.experiment.evaluation import EVALUATION_SEED
 from sb3_offline.experiment.evaluation_table import EvaluationTable
 from sb3_offline.experiment.run import TrainingRun
-from sb3_offline.experiment.training import find_algorithm
+from sb3_offline.experiment.training import learns_from_examples
 
 #: Method, task and seed.
 Cell: TypeAlias = tuple[str, str, int]
@@ -223,8 +223,8 @@ def _run(
     :param tasks: the tasks to evaluate on
     """
     method = grid.methods[name]
-    dataset, examples = _data(grid, method)
-    if _takes_examples(method) and examples is None:
+    dataset, examples = _data(grid, method, config)
+    if _takes_examples(method, config) and examples is None and "labels" not in config:
         raise RuntimeError(f"{name} learns from success examples; say where they are: `examples:`")
     env_kwargs = {**config.get("env_kwargs", {}), **grid.env_kwargs}
     training = TrainingRun(
@@ -241,19 +241,21 @@ def _run(
     return GridRun(f"{name} {', '.join(tasks)} seed {seed}", tuple(tasks), training, grid)
 
 
-def _takes_examples(method: Method) -> bool:
-    return issubclass(find_algorithm(method.algo), ExampleBasedAlgorithm)
+def _takes_examples(method: Method, config: dict[str, Any]) -> bool:
+    """:return: True if the algorithm learns from success examples, or its episodes or rewards are found by these"""
+    return learns_from_examples(method.algo) or uses_labels(config)
 
 
 def _depends_on_task(grid: Grid, method: Method, config: dict[str, Any]) -> bool:
     """:return: True if the examples, the files or the episodes that a method learns from differ between tasks"""
-    return any("{task}" in str(text) for text in (*_data(grid, method), config.get("episodes")))
+    texts = (*_data(grid, method, config), config.get("episodes"), config.get("labels"))
+    return any("{task}" in str(text) for text in texts)
 
 
-def _data(grid: Grid, method: Method) -> tuple[Any, Any]:
+def _data(grid: Grid, method: Method, config: dict[str, Any]) -> tuple[Any, Any]:
     """:return: paths of a method's dataset and examples: those of its changes, or else of the grid"""
     dataset, examples = (method.changes.get(name, getattr(grid, name)) for name in ("dataset", "examples"))
-    return dataset, examples if _takes_examples(method) else None
+    return dataset, examples if _takes_examples(method, config) else None
 
 
 def _filled(paths: Any, task: str) -> Any:

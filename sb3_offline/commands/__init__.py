@@ -12,6 +12,7 @@ COMMANDS = {
     "train-sac": "train the agents that collect-sac rolls out",
     "select-sac": "select checkpoints of train-sac for collect-sac, and measure them",
     "examples": "draw success examples from a labelled dataset",
+    "label": "find the successful episodes of a dataset by success examples, without labels",
     "inspect": "show the content of a dataset and likely mistakes in it",
     "render": "draw the frames of a dataset again, with another size or camera",
     "convert": "compress or uncompress a dataset, or convert it from and to other libraries",

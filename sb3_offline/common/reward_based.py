@@ -1,7 +1,7 @@
 """The base of the algorithms that learn from rewards."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch as th
@@ -13,8 +13,21 @@ from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetLike
 
-#: Rewards ``(batch,)`` of a batch of transitions; or ``"success"``, the success labels of the dataset.
-RewardFunction = Callable[[OfflineSamples], Any] | str
+
+@runtime_checkable
+class DataRewards(Protocol):
+    """Rewards that belong to certain data, such as the labels of :func:`sb3_offline.label_episodes`."""
+
+    def rewards_of(self, buffer: OfflineReplayBuffer) -> np.ndarray:
+        """
+        :param buffer: the data that a model learns from; raises ``DatasetError`` if the rewards belong to others
+        :return: (N,) float32
+        """
+        ...
+
+
+#: Rewards ``(batch,)`` of a batch of transitions; labels of the data; or ``"success"``, the success labels of the dataset.
+RewardFunction = Callable[[OfflineSamples], Any] | DataRewards | str
 
 
 class RewardBasedAlgorithm(ActorCriticAlgorithm):
@@ -28,7 +41,8 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
         dataset's. It is called once for each transition, when the dataset is opened, and is saved with the model. Its
         argument is an :class:`~sb3_offline.data.buffer.OfflineSamples` (``observations``, ``actions`` scaled to [-1, 1],
         ``next_observations``, ``dones``, ``rewards`` of the dataset, as tensors on the model's device). ``"success"`` takes
-        the dataset's success labels, 0 or 1, as rewards.
+        the dataset's success labels, 0 or 1, as rewards, and the labels of :func:`~sb3_offline.label_episodes` stand for
+        themselves: ``reward_fn=label_episodes(dataset, examples)``.
     :param kwargs: see :class:`~sb3_offline.common.offline_algorithm.OfflineAlgorithm`
     """
 
@@ -42,7 +56,8 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
     ):
         super().__init__(policy, env, dataset, **kwargs)
         if isinstance(reward_fn, str) and reward_fn != "success":
-            raise TypeError(f"{type(self).__name__}: reward_fn is {reward_fn!r}; give a function, or 'success'")
+            remedy = "give a function, 'success', or the labels that are made from examples: label_episodes(dataset, examples)"
+            raise TypeError(f"{type(self).__name__}: reward_fn is {reward_fn!r}; {remedy}")
         self.reward_fn = reward_fn
 
     def _data_inputs(self) -> tuple[Any, ...]:
@@ -56,7 +71,9 @@ class RewardBasedAlgorithm(ActorCriticAlgorithm):
             normalizer.ret_rms.var = np.array(buffer.return_variance(normalizer.gamma))
 
     def relabel(self, buffer: OfflineReplayBuffer) -> None:
-        if callable(self.reward_fn):
+        if isinstance(self.reward_fn, DataRewards):
+            buffer.rewards = self.reward_fn.rewards_of(buffer)
+        elif callable(self.reward_fn):
             buffer.relabel(self.reward_fn)
         elif self.reward_fn is not None:
             buffer.rewards = buffer.success_rewards()

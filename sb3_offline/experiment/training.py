@@ -13,12 +13,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_offline
+from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import replacing
 from sb3_offline.data.pickles import check_model
 from sb3_offline.envs import lacks_task
-from sb3_offline.experiment.data import data_arguments
+from sb3_offline.experiment.data import DATA_ENTRIES, data_arguments
 from sb3_offline.experiment.evaluation import make_evaluation_env
 from sb3_offline.experiment.evaluation_table import EvaluationTable
 from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, TrainingRun
@@ -107,6 +108,14 @@ def find_algorithm(name: str) -> type[OfflineAlgorithm]:
     return sb3_offline.ALGOS[name]
 
 
+def learns_from_examples(name: str) -> bool:
+    """
+    :param name: name in :data:`sb3_offline.ALGOS`
+    :return: True if the algorithm's constructor takes success examples
+    """
+    return issubclass(find_algorithm(name), ExampleBasedAlgorithm)
+
+
 def create_model(
     algo: str,
     config: dict[str, Any],
@@ -126,8 +135,9 @@ def create_model(
     :param kwargs: further constructor arguments
     :return: the model; raises ``RuntimeError`` if the constructor refuses its arguments
     """
-    arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", "episodes")}
-    arguments = {**arguments, "env": None, **data_arguments(config, dataset, examples), "seed": seed, **kwargs}
+    arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", *DATA_ENTRIES)}
+    data = data_arguments(config, dataset, examples, takes_examples=learns_from_examples(algo))
+    arguments = {**arguments, "env": None, **data, "seed": seed, **kwargs}
     if isinstance(arguments.get("learning_rate"), str):
         arguments["learning_rate"] = _schedule(arguments["learning_rate"])
     try:
@@ -255,7 +265,7 @@ def _saved_model(run: TrainingRun, config: dict[str, Any], tables: list[Evaluati
     file = run.output / RESUME_FILE
     if not (run.save_freq and file.is_file() and run.is_recorded()):
         return None
-    arguments = data_arguments(config, run.dataset, run.examples)
+    arguments = data_arguments(config, run.dataset, run.examples, takes_examples=learns_from_examples(run.algo))
     try:
         model = find_algorithm(run.algo).load(file, **arguments)
     except DatasetError:  # the data, not the save

@@ -33,7 +33,7 @@ class Calibration(NamedTuple):
         return _sigmoid(self.slope * logits.astype(np.float64) + self.offset).astype(np.float32)
 
 
-def calibrate(example_logits: np.ndarray, data_logits: np.ndarray) -> Calibration:
+def calibrate(example_logits: np.ndarray, data_logits: np.ndarray, weights: np.ndarray | None = None) -> Calibration:
     """
     Fit a logistic regression of "success or failure" on logits of networks that saw neither these examples nor these data.
     No datum is labelled, but a share eta of the data looks like the examples, so the cross-entropy over successes and
@@ -42,32 +42,41 @@ def calibrate(example_logits: np.ndarray, data_logits: np.ndarray) -> Calibratio
 
     :param example_logits: (n,) of success examples
     :param data_logits: (m,) of observations of the data
+    :param weights: (m,) weights of the data (default: equal)
     :return: the calibration
     """
     examples, data = example_logits.astype(np.float64), data_logits.astype(np.float64)
-    share = share_of_successes(examples, data)
-    return Calibration(*_positive_unlabelled_regression(examples, data, share), share)
+    weights = np.ones(len(data)) if weights is None else weights
+    share = share_of_successes(examples, data, weights)
+    slope, offset = _positive_unlabelled_regression(examples, data, weights / weights.sum(), share)
+    return Calibration(slope, offset, share)
 
 
-def share_of_successes(example_logits: np.ndarray, data_logits: np.ndarray) -> float:
+def share_of_successes(example_logits: np.ndarray, data_logits: np.ndarray, weights: np.ndarray) -> float:
     """
     Estimate the share of the data that looks like the examples. Above any threshold lie a known share of the examples and as
     large a share of the data's successes, so that the data's share above it, divided by the examples', bounds the wanted
-    share from above. The lowest bound is the estimate (best bin estimation, https://arxiv.org/abs/2111.00980).
+    share from above. The lowest bound is the estimate (best bin estimation, https://arxiv.org/abs/2111.00980). Only low
+    thresholds are tried, with most of the examples above them: then the estimate also holds where the data's successes look
+    otherwise spread than the examples, as pictures that a person took do.
 
     :param example_logits: (n,) of success examples
     :param data_logits: (m,) of observations of the data
+    :param weights: (m,) weights of the data
     :return: the share
     """
     thresholds = np.quantile(example_logits, EXAMPLE_QUANTILES)
-    examples, data = (np.array([(x >= t).mean() for t in thresholds]) for x in (example_logits, data_logits))
+    examples = np.array([(example_logits >= threshold).mean() for threshold in thresholds])
+    data = np.array([weights[data_logits >= threshold].sum() for threshold in thresholds]) / weights.sum()
     # Few examples lie above a high threshold, and their share is known less well
     margins = np.sqrt(np.log(1 / BOUND_FAILS) / (2 * len(example_logits)))
     best = np.argmin(data / examples * (1 + margins / examples))
-    return float(np.clip(data[best] / examples[best], 1 / len(data_logits), 1 - 1 / len(data_logits)))
+    return float(np.clip(data[best] / examples[best], 1 / weights.sum(), 1 - 1 / weights.sum()))
 
 
-def _positive_unlabelled_regression(examples: np.ndarray, data: np.ndarray, share: float, steps: int = 100) -> tuple:
+def _positive_unlabelled_regression(
+    examples: np.ndarray, data: np.ndarray, weights: np.ndarray, share: float, steps: int = 100
+) -> tuple[float, float]:
     """:return: slope and offset, by Newton's method"""
     design = np.stack([data, np.ones_like(data)], axis=1)
     wanted = share * np.array([examples.mean(), 1.0])
@@ -75,8 +84,8 @@ def _positive_unlabelled_regression(examples: np.ndarray, data: np.ndarray, shar
     parameters = np.array([1.0, np.log(share / (1 - share)) - np.quantile(examples, 0.1)])
     for _ in range(steps):
         p = _sigmoid(design @ parameters)
-        gradient = design.T @ p / len(data) - wanted + penalty @ (parameters - [1.0, 0.0])
-        hessian = (design * (p * (1 - p))[:, None]).T @ design / len(data) + penalty + 1e-9 * np.eye(2)
+        gradient = design.T @ (weights * p) - wanted + penalty @ (parameters - [1.0, 0.0])
+        hessian = (design * (weights * p * (1 - p))[:, None]).T @ design + penalty + 1e-9 * np.eye(2)
         step = np.linalg.solve(hessian, gradient)
         parameters = parameters - step * min(1.0, 1 / max(np.abs(step).max(), 1e-12))
         if np.abs(step).max() < 1e-8:

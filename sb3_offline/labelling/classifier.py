@@ -65,11 +65,15 @@ class StepProbabilities(NamedTuple):
     :param rows: (N + E,) float32, of each observation: episode e of n steps has n + 1 of them, one after the other
     :param lengths: (E,) int64, steps of each episode
     :param calibration: how logits became probabilities
+    :param logits: (N + E,) float32, of each observation, from a network that did not learn from its episode
+    :param example_logits: (n,) float32, of each example, from a network that did not learn from it
     """
 
     rows: np.ndarray
     lengths: np.ndarray
     calibration: Calibration
+    logits: np.ndarray
+    example_logits: np.ndarray
 
     @property
     def before(self) -> np.ndarray:
@@ -82,7 +86,15 @@ class StepProbabilities(NamedTuple):
         (N,) float32, for each step the probability of the observation that it leads to. Success labels of environments are
         of this observation, so it decides about episodes and gives rewards.
         """
-        return np.delete(self.rows, np.cumsum(self.lengths + 1) - self.lengths - 1)
+        return self.rows[rows_after(self.lengths)]
+
+
+def rows_after(lengths: np.ndarray) -> np.ndarray:
+    """
+    :param lengths: (E,) steps of each episode
+    :return: (N,) int64, for each step the row of the observation that it leads to
+    """
+    return np.delete(np.arange(lengths.sum() + len(lengths)), np.cumsum(lengths + 1) - lengths - 1)
 
 
 class StateClassifier(CountingFromZero):
@@ -139,7 +151,7 @@ def success_probabilities(
 
     :param buffer: the data, on the device to compute on. Its observations are read as the files hold them
     :param examples: ``(n, *observation)`` in the buffer's space (images channel-first), or a dict of these; from
-        :func:`~sb3_offline.data.examples.load_examples`
+        :func:`~sb3_offline.data.examples.load_examples`. Keys that a dict lacks are not looked at in the data either
     :param settings: how to train (default: ``ClassifierSettings()``)
     :param make_encoder: makes a new encoder of observations (default: that of our ``MlpPolicy``, ``CnnPolicy`` or
         ``MultiInputPolicy``, by the space)
@@ -148,14 +160,16 @@ def success_probabilities(
     :raises DatasetError: if there are fewer examples or episodes than networks
     """
     settings = settings or ClassifierSettings()
-    lengths, arrays = buffer.lengths, _columns(examples)
+    lengths, arrays, space = buffer.lengths, _columns(examples), buffer.observation_space
+    if isinstance(space, spaces.Dict):
+        space = spaces.Dict({key: space[key] for key in space if key in arrays})
     n_examples = len(next(iter(arrays.values())))
     k = settings.n_models
     for field, n in (("episodes", len(lengths)), ("examples", n_examples)):
         if n < k:
             problem = f"are {n}, but the classifier needs {k} at least, to be judged on those that it has not seen"
             raise DatasetError(buffer.datasets[0].path, field, problem, f"Give more {field}")
-    rng = np.random.default_rng(seed)
+    rng, source = np.random.default_rng(seed), _Observations(buffer, space, arrays)
     fold_of_row = np.repeat(_folds(len(lengths), k, rng), lengths + 1)
     fold_of_example = _folds(n_examples, k, rng)
     row_logits, example_logits = (np.empty(n, np.float32) for n in (len(fold_of_row), n_examples))
@@ -164,11 +178,11 @@ def success_probabilities(
         seen_rows, seen_examples = (np.flatnonzero(of != fold) for of in (fold_of_row, fold_of_example))
         if k == 1:
             seen_rows, seen_examples = unseen_rows, unseen_examples
-        model = _train(buffer, seen_rows, arrays, seen_examples, settings, make_encoder, rng)
-        row_logits[unseen_rows] = _logits(model, buffer.observations_at, unseen_rows)
-        example_logits[unseen_examples] = _logits(model, lambda rows: _batch(arrays, rows, buffer), unseen_examples)
+        model = _train(source, seen_rows, seen_examples, settings, make_encoder, rng)
+        row_logits[unseen_rows] = _logits(model, source.data, unseen_rows)
+        example_logits[unseen_examples] = _logits(model, source.examples, unseen_examples)
     calibration = calibrate(example_logits, row_logits)
-    return StepProbabilities(calibration(row_logits), lengths, calibration)
+    return StepProbabilities(calibration(row_logits), lengths, calibration, row_logits, example_logits)
 
 
 def _folds(n: int, k: int, rng: np.random.Generator) -> np.ndarray:
@@ -182,22 +196,40 @@ def _columns(examples: Observations) -> dict[str, np.ndarray]:
     return {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
 
 
-def _batch(arrays: dict[str, np.ndarray], rows: np.ndarray, buffer: OfflineReplayBuffer) -> PyTorchObs:
-    batch = {key: th.as_tensor(array[rows], device=buffer.device) for key, array in arrays.items()}
-    return batch if isinstance(buffer.observation_space, spaces.Dict) else batch[""]
+class _Observations(NamedTuple):
+    """
+    Where batches come from.
+
+    :param buffer: the data
+    :param space: the buffer's space, or of a Dict only the keys that the examples have
+    :param arrays: the examples by key ("" without a dict)
+    """
+
+    buffer: OfflineReplayBuffer
+    space: spaces.Space
+    arrays: dict[str, np.ndarray]
+
+    def data(self, rows: np.ndarray) -> PyTorchObs:
+        """:return: these observations of the data"""
+        batch = self.buffer.observations_at(rows)
+        return {key: batch[key] for key in self.space} if isinstance(self.space, spaces.Dict) else batch  # type: ignore
+
+    def examples(self, rows: np.ndarray) -> PyTorchObs:
+        """:return: these examples"""
+        batch = {key: th.as_tensor(array[rows], device=self.buffer.device) for key, array in self.arrays.items()}
+        return batch if isinstance(self.space, spaces.Dict) else batch[""]
 
 
 def _train(
-    buffer: OfflineReplayBuffer,
+    source: _Observations,
     rows: np.ndarray,
-    arrays: dict[str, np.ndarray],
     example_rows: np.ndarray,
     settings: ClassifierSettings,
     make_encoder: EncoderFactory | None,
     rng: np.random.Generator,
 ) -> StateClassifier:
     """:return: a classifier, trained on these rows of the data and of the examples"""
-    space = buffer.observation_space
+    buffer, space = source.buffer, source.space
     gradient_steps = settings.gradient_steps or (IMAGE_STEPS if has_images(space) else VECTOR_STEPS)
     with th.random.fork_rng(devices=[buffer.device] if buffer.device.type == "cuda" else []):
         th.manual_seed(int(rng.integers(2**31)))
@@ -208,10 +240,9 @@ def _train(
     optimizer = th.optim.Adam(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
     with th.enable_grad():
         for _ in range(gradient_steps):
-            data = buffer.observations_at(rng.choice(rows, settings.batch_size))
-            drawn = example_rows[rng.integers(len(example_rows), size=settings.batch_size)]
-            shown = _batch(arrays, drawn, buffer)
-            data, shown = (shift_observations(part, space, settings.max_shift, rng) for part in (data, shown))
+            data = source.data(rng.choice(rows, settings.batch_size))
+            shown = source.examples(rng.choice(example_rows, settings.batch_size))
+            data, shown = (shift_observations(batch, space, settings.max_shift, rng) for batch in (data, shown))
             loss = positive_unlabelled_loss(model(shown), model(data), settings.positive_share)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()

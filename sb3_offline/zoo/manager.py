@@ -14,6 +14,7 @@ from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.config import config_path, number_or_text, python_value
 from sb3_offline.experiment.data import resolve_data
+from sb3_offline.experiment.training import learns_from_examples
 from sb3_offline.zoo.hyperparams import sample_params
 
 
@@ -64,7 +65,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
         if self.algo in sb3_offline.ALGOS:
-            hyperparams = resolve_data(hyperparams, hyperparams["env_kwargs"])
+            hyperparams = resolve_data(hyperparams, hyperparams["env_kwargs"], learns_from_examples(self.algo))
             if hyperparams.get("dataset") is None:
                 remedy = "add `dataset:` to it, or give --hyperparams \"dataset:'my_data.h5'\""
                 raise RuntimeError(f"{self.config}: names no dataset for {self.env_name.gym_id}; {remedy}")
