@@ -1,6 +1,6 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import torch as th
@@ -109,6 +109,8 @@ class CEBORL(RecursiveClassifier):
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
     :param policy_random_shift: the same for the images that the policy imitates, and for no others (default:
         ``random_shift``), for ``policy_extraction="weighted"``
+    :param example_keys: keys of dict observations that the classifier sees, where examples show some keys only (default: those
+        that the examples hold)
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -176,6 +178,7 @@ class CEBORL(RecursiveClassifier):
         target_update_interval: int = 1,
         random_shift: int = 0,
         policy_random_shift: int | None = None,
+        example_keys: Sequence[str] | None = None,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -191,6 +194,7 @@ class CEBORL(RecursiveClassifier):
             dataset,
             examples,
             example_batch_size=example_batch_size,
+            example_keys=example_keys,
             omega_max=omega_max,
             class_prior=class_prior,
             example_share=example_share,

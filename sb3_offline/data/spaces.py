@@ -5,7 +5,7 @@ import math
 import operator
 import os
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,16 @@ def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
     if isinstance(space, spaces.Dict):
         return {f"{name}/{key}": subspace for key, subspace in space.items()}
     return {name: space}
+
+
+def subspace(space: spaces.Space, keys: Sequence[str]) -> spaces.Dict:
+    """
+    :param space: a Dict space
+    :param keys: some of its keys
+    :return: the Dict space of these keys, in the order that they have in ``space``
+    """
+    assert isinstance(space, spaces.Dict)
+    return spaces.Dict(OrderedDict((key, part) for key, part in space.spaces.items() if key in keys))
 
 
 def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
