@@ -10,14 +10,16 @@ from PIL import Image
 from point_mass import ACTIONS, GOALS, N_STEPS, SPEED, PointMass, goal_examples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_offline import CEBORL, DCQL, ORIL, RCE
+from sb3_offline import CEBORL, DCQL, ORIL, RCE, cli
 from sb3_offline.common.online import export_sac
 from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import load_examples, save_examples
+from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.evaluation import OfflineEvalCallback
 from sb3_offline.experiment.evaluation import evaluate_success
+from sb3_offline.experiment.training import load_run
 
 FRAMES = make_observations(IMAGES, 5, np.random.default_rng(0))
 VECTORS = make_observations(STATES, 5, np.random.default_rng(1))
@@ -145,7 +147,7 @@ def test_what_is_refused(folder):
         make(CEBORL, folder, policy_kwargs={**SMALL, "share_features_extractor": True})
     with pytest.raises(TypeError, match=r"example_keys is \['picture'\]; give some of .*'image', 'joints'"):
         make(ORIL, folder, example_keys=["picture"])
-    with pytest.raises(TypeError, match="example_keys is .*, but observations have no keys"):
+    with pytest.raises(TypeError, match=r"example_keys is .*, but observations have no keys"):
         DCQL("MlpPolicy", SpacesOnlyEnv(STATES, ACTIONS), example_keys=["image"])
     with pytest.raises(DatasetError, match=r"hold \['image'\] and lack \['joints'\]"):
         make(RCE, folder, example_keys=["image", "joints"]).learn(1)
@@ -232,3 +234,35 @@ def test_ceborl_learns_from_examples_that_do_not_show_all_that_the_policy_needs(
         policy_kwargs={"net_arch": [64, 64]},
     ).learn(600)
     assert evaluate_success(model, "TestMirroredPointMass-v0", {"goal": 0}, 20).success_rate >= 0.9
+
+
+def test_the_table_with_images_and_hand_is_learned_from_images_of_success(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("metaworld")
+    from stable_baselines3.common.env_checker import check_env
+
+    from sb3_offline.data_tools.converting.render_dataset import render_dataset
+
+    monkeypatch.chdir(tmp_path)
+    env = gym.make("MultimodalMetaworld-v0", task="drawer-open", obs_type="both", frame_size=40)
+    check_env(env.unwrapped)
+    env.close()
+    collect = ["--episodes-per-task", "1", "--tasks", "drawer-open", "--seed", "2", "--workers", "1"]
+    cli.main(["collect", "both.h5", "--obs-type", "both", *collect])
+    cli.main(["collect", "states.h5", "--obs-type", "state", *collect])
+    render_dataset("states.h5", "drawn.h5", obs_type="both", n_workers=1, progress=False)
+    collected, drawn = OfflineDataset("both.h5"), OfflineDataset("drawn.h5")
+    assert collected.observation_space == drawn.observation_space and collected.env_kwargs["obs_type"] == "both"
+    for name in collected.arrays:
+        np.testing.assert_array_equal(collected.arrays[name], drawn.arrays[name])
+
+    cli.main(["examples", "both.h5", "-o", "images.h5", "-n", "3", "--keys", "image"])
+    assert list(load_examples("images.h5", collected.observation_space)) == ["image"]
+    cli.main(["inspect", "both.h5", "--examples", "images.h5", "--html", "page.html"])
+    assert "3 examples" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        cli.main(["examples", "both.h5", "-o", "other.h5", "-n", "3", "--keys", "picture"])
+    options = ["--dataset", "both.h5", "--examples", "images.h5", "--task", "drawer-open", "-n", "2", "--output", "run"]
+    cli.main(["train", "--config", "ceborl_both", *options, "--hyperparams", "batch_size:4", "policy_batches:2"])
+    model, config = load_run(tmp_path / "run" / "model.zip")
+    assert model.example_keys == ["image"] and config["env_kwargs"] == {"obs_type": "both", "task": "drawer-open"}
+    assert len(evaluate_success(model, config["env"], {**config["env_kwargs"], "episode_length": 2}, 1).successes) == 1

@@ -47,7 +47,7 @@ def check_examples(
     episodes, references = _sampled(data, rng)
     rows = np.concatenate([data.observation_starts[e] + np.arange(data.lengths[e] + 1) for e in episodes])
     of_episode = np.repeat(episodes, data.lengths[episodes] + 1)
-    names = list(subspaces(data.observation_space, "observations"))
+    names = list(arrays)
     sample = [_features(data.arrays[name], rows) for name in names]
     scales = [_scale(part, len(data.arrays[name].shape) == 4) for name, part in zip(names, sample, strict=True)]
     frames = _standardised(sample, scales)
@@ -88,9 +88,11 @@ def check_examples(
 
 
 def _by_name(data: JoinedDatasets, observations: Observations) -> dict[str, np.ndarray]:
+    """:return: the examples by the names of the data's arrays, of which they may lack some"""
     names = subspaces(data.observation_space, "observations")
     if isinstance(observations, dict):
-        return {name: observations[name.removeprefix("observations/")] for name in names}
+        by_name = {name: observations.get(name.removeprefix("observations/")) for name in names}
+        return {name: array for name, array in by_name.items() if array is not None}
     return dict.fromkeys(names, observations)
 
 

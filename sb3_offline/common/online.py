@@ -37,7 +37,8 @@ def export_sac(
     observations are standardised as before.
 
     Critics that learned from rewards are kept. Critics that learned from examples do not estimate rewards, so SAC gets new
-    ones on the same encoder, or on a copy of the policy's where theirs sees the keys of the examples only. A deterministic actor gets a standard deviation of 0.1 before the tanh.
+    ones on the same encoder; where that sees the keys of the examples only, on a copy of the policy's. A deterministic actor
+    gets a standard deviation of 0.1 before the tanh.
 
     :param model: trained actor-critic. If it learned with a ``VecNormalize``, that must be its environment, and SAC must be
         loaded with it too

@@ -121,6 +121,16 @@ def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
     return space == other
 
 
+def stack_observations(observations: Sequence[Any]) -> Any:
+    """
+    :param observations: single observations of a space
+    :return: array of these as rows; a dict of such arrays for a Dict space
+    """
+    if isinstance(observations[0], Mapping):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
 def check_observations(
     value: Any, space: spaces.Space, rows: int | None, file: str | os.PathLike, name: str = "observations"
 ) -> dict[str, np.ndarray]:

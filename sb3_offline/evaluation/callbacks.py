@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.common.callbacks import log_at_once
 from sb3_offline.common.example_based import ExamplesLike
+from sb3_offline.common.normalization import normalize_parts
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.examples import load_examples
@@ -73,9 +74,9 @@ class OfflineEvalCallback(BaseCallback):
         self.indices = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
         self.example_observations: PyTorchObs | None = None
         if self.examples is not None:
-            arrays = load_examples(self.examples, model.observation_space)
+            arrays: Any = load_examples(self.examples, model.observation_space, getattr(model, "example_keys", None))
             if model._vec_normalize_env is not None:
-                arrays = model._vec_normalize_env.normalize_obs(arrays)
+                arrays = normalize_parts(model._vec_normalize_env, arrays)
             if isinstance(arrays, dict):
                 self.example_observations = {key: th.as_tensor(array, device=model.device) for key, array in arrays.items()}
             else:

@@ -70,7 +70,7 @@ class OfflineExperimentManager(ExperimentManager):
                 raise RuntimeError(f"{self.config}: names no dataset for {self.env_name.gym_id}; {remedy}")
             datasets = open_datasets(hyperparams["dataset"])
             if hyperparams.get("examples") is not None:
-                load_examples(hyperparams["examples"], datasets[0].observation_space)
+                load_examples(hyperparams["examples"], datasets[0].observation_space, hyperparams.get("example_keys"))
         hyperparams, *rest = super()._preprocess_hyperparams(hyperparams)
         if self.algo in sb3_offline.ALGOS:
             policy_kwargs = hyperparams.setdefault("policy_kwargs", {})
