@@ -17,6 +17,7 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import ExamplesLike, load_examples
 from sb3_offline.data.reader import DatasetLike
 from sb3_offline.data.spaces import subspace
+from sb3_offline.data.stacking import frame_space, repeated_frames
 
 __all__ = ["ExampleBasedAlgorithm", "ExamplesLike"]
 
@@ -79,7 +80,8 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
                 raise TypeError(f"{type(self).__name__}: {problem}, {list(space.spaces)}")
         elif self.examples is not None:
             try:
-                given = list(load_examples(self.examples, space))
+                found = self.load_examples(self.examples)  # of the keys that they hold
+                given = list(found) if isinstance(found, dict) else None
             except DatasetError:  # is raised again when the model learns: until then, it needs no examples
                 pass
         return [key for key in space.spaces if given is None or key in given]
@@ -121,6 +123,27 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
         distinct, rows = np.unique(drawn, return_inverse=True)
         return self._examples_at(distinct), th.as_tensor(rows, device=self.device)
 
+    def load_examples(self, examples: ExamplesLike) -> np.ndarray | dict[str, np.ndarray]:
+        """
+        Read success examples, the model's own or others, as observations of :attr:`example_space`.
+
+        Where observations are stacks of frames, an example is one frame, repeated as in a solved scene that rests.
+        Arrays of whole stacks are taken as they are.
+
+        :param examples: in any form that learners take
+        :return: ``(n, *shape)``, or a dict of such arrays; raises ``DatasetError`` if they do not fit
+        """
+        frames = frame_space(self.observation_space, self.n_stack)
+        try:
+            return repeated_frames(load_examples(examples, frames, self.example_keys), frames, self.n_stack)
+        except DatasetError:
+            if self.n_stack > 1:
+                try:
+                    return load_examples(examples, self.observation_space, self.example_keys)
+                except DatasetError:  # what is wrong with them as frames says more
+                    pass
+            raise
+
     def read_examples(self) -> np.ndarray | dict[str, np.ndarray]:
         """
         :return: all success examples as observations of :attr:`example_space`, read once; raises ``RuntimeError`` if the model
@@ -132,7 +155,7 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
                 "or `load(path, examples=...)`"
             )
         if self._read_examples[0] is not self.examples:
-            self._read_examples = self.examples, load_examples(self.examples, self.observation_space, self.example_keys)
+            self._read_examples = self.examples, self.load_examples(self.examples)
         return self._read_examples[1]
 
     def _example_arrays(self) -> dict[str, np.ndarray]:

@@ -85,6 +85,8 @@ def export_sac(
             problem, remedy = "are missing, but SAC learns from them", "Give a dataset with rewards, or data_ratio=0"
             raise DatasetError(buffer.datasets[0].path, "rewards", problem, remedy)
         sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
+        if model.n_stack > 1:
+            sac.replay_buffer_kwargs["n_stack"] = model.n_stack
         if buffer.is_relabelled:  # SAC goes on with the rewards that the critic learned from.
             sac.replay_buffer_kwargs.update(rewards=buffer.rewards, checksum=buffer.checksum())
     sac.save(Path(path))

@@ -67,6 +67,11 @@ def load_examples(examples: ExamplesLike, observation_space: spaces.Space, keys:
             remedy = "Multiply them by 255 before casting to uint8"
             raise DatasetError(file, name, "holds only the values 0 and 1", remedy)
     if isinstance(observation_space, spaces.Dict):
+        held = list(observation_space.spaces)
+        if missing := [key for key in keys or [] if key not in held]:
+            problem = f"hold {held} and lack {missing}, by which the learner knows success"
+            remedy = "Give an array for each key, or make a model that knows success by these: example_keys=[...]"
+            raise DatasetError(file, "examples", problem, remedy)
         return {name.removeprefix("examples/"): array for name, array in arrays.items()}
     return arrays["examples"]
 
@@ -98,12 +103,6 @@ def _by_key(examples: Any, file: str | os.PathLike, space: spaces.Dict, keys: Se
     if unknown := sorted(map(str, value.keys() - space.spaces.keys())):
         problem = f"are {sorted(map(str, value))}, but the observation space has no {unknown}"
         raise DatasetError(file, "examples", problem, f"Name the arrays as the space does: {list(space.spaces)}")
-    if missing := [key for key in keys or [] if key not in value]:
-        problem = f"hold {sorted(value)} and lack {missing}, by which the learner knows success"
-        remedy = (
-            "Give an array for each key, or make a model that knows success by the keys that they hold: example_keys=[...]"
-        )
-        raise DatasetError(file, "examples", problem, remedy)
     return {key: _part(value[key], file, key, part) for key, part in parts.items() if key in value}
 
 
