@@ -1,5 +1,7 @@
 """Stacks of frames: the buffer's are those of SB3's VecFrameStack, and policies play in it."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,11 +9,12 @@ import torch as th
 from data_files import ACTIONS, OPTIONS, make_episode, make_observations
 from gymnasium import spaces
 from PIL import Image
+from point_mass import write_point_mass
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_offline import CEBORL, DCQL, IQL
+from sb3_offline import BC, CEBORL, DCQL, IQL, cli
 from sb3_offline.common.online import export_sac
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
@@ -200,3 +203,33 @@ def test_an_example_is_one_frame_that_is_repeated(both, tmp_path):
 def test_a_config_names_it_as_the_rl_zoo_does(both):
     model = create_model("iql", {"policy": "MultiInputPolicy", "frame_stack": 3, "policy_kwargs": SMALL}, both)
     assert model.n_stack == 3 and model.observation_space["state"].shape == (9,)
+
+
+CONFIG = """
+TestPointMass-v0: {policy: MlpPolicy, n_timesteps: 4, dataset: points.h5, batch_size: 8, policy_kwargs: {net_arch: [8]}, NAME: 3}
+"""
+
+
+@pytest.mark.parametrize("name", ["frame_stack", "n_stack"])
+def test_programs_stack_frames_by_either_name(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_point_mass("points.h5", n_episodes=10)
+    (tmp_path / "my.yml").write_text(CONFIG.replace("NAME", name))
+    options = ["--algo", "bc", "--env", "TestPointMass-v0"]
+    cli.main(["train", *options, "--config", "my.yml", "-o", "run", "--eval-freq", "2", "--eval-episodes", "1"])
+    cli.main(["evaluate", "run/model.zip", "--episodes", "2"])
+    assert "of 2 episodes solved" in capsys.readouterr().out
+
+    pytest.importorskip("rl_zoo3")
+    from rl_zoo3.enjoy import enjoy
+
+    from sb3_offline.zoo import train
+
+    for program, rest in (
+        (train.main, ["--conf-file", "my.yml", "--seed", "0", "--eval-freq", "2", "--eval-episodes", "1"]),
+        (enjoy, ["-f", "logs", "--no-render", "-n", "25", "--load-best"]),
+    ):
+        monkeypatch.setattr(sys, "argv", ["program", *options, *rest])
+        program()
+    assert "Stacking 3 frames" in capsys.readouterr().out
+    assert BC.load("logs/bc/TestPointMass-v0_1/best_model.zip").n_stack == 3

@@ -331,7 +331,7 @@ class OfflinePolicy(SACPolicy):
         return actor.to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineCritic:
-        critic_kwargs = self.critic_kwargs
+        critic_kwargs: dict[str, Any] = self.critic_kwargs
         if self.critic_keys is not None:
             seen = subspace(self.observation_space, self.critic_keys)
             critic_kwargs = {**critic_kwargs, "observation_space": seen}
