@@ -75,8 +75,8 @@ def test_dict_and_state_examples(tmp_path):
     assert load_examples(examples["state"].astype(np.float64), STATES).dtype == np.float32
     with pytest.raises(DatasetError, match="examples/state: holds 3 examples, but other keys hold 4"):
         load_examples({**examples, "state": examples["state"][:3]}, learner)
-    with pytest.raises(DatasetError, match=r"is not a dict with the keys \['image', 'state'\]"):
-        load_examples(examples["image"], learner)
+    with pytest.raises(DatasetError, match=r"hold \['image'\] and lack \['state'\].*example_keys"):
+        load_examples({"image": examples["image"]}, learner, ["image", "state"])
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import shutil
 import textwrap
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from format_files import write_aloha, write_maniskill, write_robomimic
@@ -25,6 +26,7 @@ from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.convert import convert
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.data_tools import SAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -41,6 +43,7 @@ FILES = {
     "data/*.h5": "pixels.h5",
     "episodes.h5": "pixels.h5",
     "images_of_success/": "images",
+    "data/robot.h5": "robot.h5",
     "rollouts.npz": "rollouts.npz",
     "lift.hdf5": "robomimic.hdf5",
     "aloha_sim_insertion/": "aloha",
@@ -124,6 +127,7 @@ def stand_ins(tmp_path_factory):
     space = OfflineDataset(folder / "pixels.h5").observation_space
     for number, frame in enumerate(load_examples(folder / "drawer_frames.h5", space)):
         Image.fromarray(frame).save(folder / f"images/{number}.png")
+    write_robot(folder / "robot.h5", OfflineDataset(folder / "pixels.h5"))
     # Two episodes of Pendulum-v1 as imitation writes them
     rollouts = {"obs": np.zeros((402, 3)), "acts": np.zeros((400, 1)), "rews": np.zeros(400), "terminal": np.ones(2, bool)}
     np.savez(folder / "rollouts.npz", indices=[200], **rollouts)
@@ -131,6 +135,17 @@ def stand_ins(tmp_path_factory):
     write_aloha(folder / "aloha", joints=14)
     write_maniskill(folder / "maniskill.h5")
     return folder
+
+
+def write_robot(path, pixels):
+    """The same episodes as images and states of the hand, a part of the state that lacks its first row in the file."""
+    env = gym.make("MultimodalMetaworld-v0", obs_type="both")
+    with DatasetWriter(path, env.observation_space, env.action_space, rewards=False, success=False) as writer:
+        for episode in range(pixels.n_episodes):
+            row, step, n = pixels.observation_starts[episode], pixels.step_starts[episode], pixels.lengths[episode]
+            hand = np.asarray(pixels.extras["state"][step : step + n])[:, :4]
+            image = np.asarray(pixels.observations[row : row + n + 1])
+            writer.add_episode({"hand": np.vstack([hand[:1], hand]), "image": image}, pixels.actions[step : step + n])
 
 
 @pytest.mark.parametrize("page", [page for page, blocks in BLOCKS.items() if blocks])

@@ -222,6 +222,7 @@ def test_paper_form(dataset, monkeypatch, n_steps):
 def test_the_paper_form_names_every_setting():
     """A preset that leaves a setting out would change with the constructor's default."""
     about_the_run = {"policy", "env", "dataset", "examples", "dataset_storage", "stats_window_size", "tensorboard_log"}
+    about_the_run |= {"example_keys"}  # of the data
     about_the_run |= {"self", "kwargs", "verbose", "seed", "device", "_init_setup_model"}
     assert PAPER_FORM.keys() == inspect.signature(CEBORL.__init__).parameters.keys() - about_the_run
 

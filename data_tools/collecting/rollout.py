@@ -11,6 +11,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from sb3_offline.data.spaces import stack_observations
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.envs import ENV_ID
 from sb3_offline.envs.multimodal_metaworld.tables import find_table
@@ -27,7 +28,7 @@ class TaskEpisode:
     :param task: the attempted task
     :param seed: seed of the environment's reset
     :param tasks: the table's tasks, in the order of `task_success`
-    :param observations: (T + 1, ...) of the environment
+    :param observations: (T + 1, ...) of the environment, or a dict of such arrays
     :param actions: (T, 4) float32
     :param task_success: (T, n_tasks) bool, after each decision
     :param task_reward: (T, n_tasks) float32
@@ -38,7 +39,7 @@ class TaskEpisode:
     task: str
     seed: int
     tasks: tuple[str, ...]
-    observations: np.ndarray
+    observations: np.ndarray | dict[str, np.ndarray]
     actions: np.ndarray
     task_success: np.ndarray
     task_reward: np.ndarray
@@ -61,7 +62,7 @@ def shared_env(obs_type: str, table: str = "paper") -> gym.Env:
     """
     Create the one environment that all episodes of a process share. It fits every task, because the tasks share their scene.
 
-    :param obs_type: "state" or "pixels"
+    :param obs_type: "state", "pixels" or "both"
     :param table: name of the table
     :return: one environment for all episodes of a process: the tasks share their scene
     """
@@ -99,8 +100,8 @@ def roll_out(env: gym.Env, task: str, seed: int, act: Callable[[int, bool], np.n
         rewards.append(info["task_reward"])
         states.append(scene_env.get_state())
         scene_states.append(scene_env.scene.get_state())
-    steps = (observations, actions, successes, rewards, states, scene_states)
-    return TaskEpisode(task, seed, scene_env.tasks, *map(np.stack, steps))
+    steps = (actions, successes, rewards, states, scene_states)
+    return TaskEpisode(task, seed, scene_env.tasks, stack_observations(observations), *map(np.stack, steps))
 
 
 def episode_writer(
@@ -117,7 +118,7 @@ def episode_writer(
     would mix those of several tasks. Its extras are arrays of `TaskEpisode`; `state` is one of them, also beside images.
 
     :param path: path of the file
-    :param obs_type: "state" or "pixels"
+    :param obs_type: "state", "pixels" or "both"
     :param tasks: the sources
     :param n_episodes: number of episodes that will be added
     :param provenance: provenance of the data

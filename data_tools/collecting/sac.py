@@ -55,7 +55,7 @@ class Collection:
 
     :param episodes_per_task: number of attempts at each task
     :param tasks: some of `TASKS`, which take turns
-    :param obs_type: "state" or "pixels": the episodes are the same either way
+    :param obs_type: "state", "pixels" or "both": the episodes are the same either way
     :param seed: seed of the whole collection
     :param held_out: use episodes that no ordinary collection with this seed contains, for success examples
     :param policies: folder of the checkpoints

@@ -144,7 +144,7 @@ def scripted_episodes(
 
     :param episodes_per_task: number of attempts at each task
     :param tasks: the tasks to attempt (default: all of the table)
-    :param obs_type: "state" or "pixels"
+    :param obs_type: "state", "pixels" or "both"
     :param seed: seed of the whole collection
     :param n_workers: number of processes; 1 collects in this one
     :param table: name of the table
@@ -179,7 +179,7 @@ def collect_scripted(
     :param path: path of the file
     :param episodes_per_task: number of attempts at each task
     :param tasks: the tasks to attempt (default: all of the table)
-    :param obs_type: "state" or "pixels"
+    :param obs_type: "state", "pixels" or "both"
     :param seed: seed of the whole collection
     :param n_workers: number of processes; the file is the same for any number
     :param progress: whether to show a progress bar

@@ -1,5 +1,6 @@
 """Draw success examples from a dataset with success labels."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,13 @@ PROGRAM = "sb3_offline.data_tools.converting.extract_examples"
 
 
 def extract_examples(
-    dataset: DatasetLike, n: int = 200, *, source: str | None = None, seed: int = 0, held_out: bool = False
+    dataset: DatasetLike,
+    n: int = 200,
+    *,
+    source: str | None = None,
+    seed: int = 0,
+    held_out: bool = False,
+    keys: Sequence[str] | None = None,
 ) -> tuple[Observations, dict[str, Any]]:
     """
     Draw observations of the solved task: those that follow a step labelled ``success``, uniformly and without repetition.
@@ -25,10 +32,17 @@ def extract_examples(
     :param source: use episodes of this source only, such as "door-open" in a file of several tasks
     :param seed: seed of the draw
     :param held_out: record that these episodes are kept out of the data to learn from
+    :param keys: keys of dict observations to read (default: all)
     :return: ``(n, *shape)`` observations in the dataset's layout (a dict of arrays for a Dict space), and their provenance;
-        raises ``DatasetError`` if there are no labels or too few successful steps
+        raises ``DatasetError`` if there are no labels, too few successful steps, or no such key
     """
     datasets = open_datasets(dataset)
+    names = [*datasets[0].observation_space] if isinstance(datasets[0].observation_space, spaces.Dict) else ["observations"]
+    if keys is not None:
+        if not set(keys) <= set(names) or names == ["observations"]:
+            problem = f"has no {list(keys)} in its observation space, {datasets[0].observation_space}"
+            raise DatasetError(datasets[0].path, "observations", problem, "Name keys of it, or leave them out (--keys)")
+        names = [name for name in names if name in keys]
     if source is not None:
         check_source(datasets, source)
     steps_of = [_success_steps(part, source) for part in datasets]
@@ -42,7 +56,7 @@ def extract_examples(
         mine = steps[chosen[(chosen >= first) & (chosen < first + len(steps))] - first]
         episodes = np.searchsorted(part.step_starts, mine, side="right") - 1
         rows = mine + episodes + 1  # the observation after the step; each earlier episode has one more row than it has steps
-        parts.append(_rows(part, rows))
+        parts.append(_rows(part, rows, names))
         origins.append({"file": part.path.name, "episodes": np.unique(episodes).tolist(), "provenance": part.provenance})
     provenance = {
         "program": PROGRAM,
@@ -52,9 +66,8 @@ def extract_examples(
         "held_out": held_out,
         "datasets": origins,
     }
-    if isinstance(datasets[0].observation_space, spaces.Dict):
-        return {key: np.concatenate([p[key] for p in parts]) for key in datasets[0].observation_space}, provenance
-    return np.concatenate([p["observations"] for p in parts]), provenance
+    arrays = {name: np.concatenate([p[name] for p in parts]) for name in names}
+    return (arrays if isinstance(datasets[0].observation_space, spaces.Dict) else arrays["observations"]), provenance
 
 
 def _success_steps(dataset: OfflineDataset, source: str | None) -> np.ndarray:
@@ -67,7 +80,7 @@ def _success_steps(dataset: OfflineDataset, source: str | None) -> np.ndarray:
     return np.flatnonzero(wanted)
 
 
-def _rows(dataset: OfflineDataset, rows: np.ndarray) -> dict[str, np.ndarray]:
+def _rows(dataset: OfflineDataset, rows: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
     observations = dataset.observations
     arrays = observations if isinstance(observations, dict) else {"observations": observations}
-    return {key: array[rows] for key, array in arrays.items()}
+    return {key: arrays[key][rows] for key in names}

@@ -19,6 +19,7 @@ from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import open_hdf5
 from sb3_offline.data.format import read_header
 from sb3_offline.data.reader import OfflineDataset
+from sb3_offline.data.spaces import stack_observations
 from sb3_offline.data.writer import DatasetWriter
 from sb3_offline.envs import ENV_ID
 from sb3_offline.parallel.processes import map_in_order
@@ -36,6 +37,7 @@ def render_dataset(
     source: str | os.PathLike[str] | OfflineDataset,
     destination: str | os.PathLike[str],
     *,
+    obs_type: str = "pixels",
     frame_size: int = 64,
     camera: Mapping[str, Any] | None = None,
     n_workers: int = 2,
@@ -43,7 +45,8 @@ def render_dataset(
     progress: bool = True,
 ) -> int:
     """
-    Write a dataset whose observations are frames. Everything else is copied from the source, which may hold states or frames.
+    Write a dataset whose observations are frames, or hold frames. Everything else is copied from the source, which may hold
+    states or frames.
 
     The frames are the ones that collecting would have drawn: to the byte, on the same renderer, if ``scene_state`` is float64.
     If it is float32, values may differ by one level. The ``env_kwargs`` of the file create the environment that observes these
@@ -51,6 +54,7 @@ def render_dataset(
 
     :param source: dataset of ``MultimodalMetaworld-v0`` with the extra ``scene_state``
     :param destination: file to write
+    :param obs_type: the environment's argument of this name: "pixels" or "both"
     :param frame_size: width and height in pixels
     :param camera: the environment's argument of this name
     :param n_workers: number of processes, which does not change the file
@@ -63,7 +67,7 @@ def render_dataset(
     destination = Path(os.path.realpath(destination))
     if destination.exists() and os.path.samefile(dataset.path, destination):
         raise DatasetError(destination, "file", "is the source itself", "Name another file to write")
-    env_kwargs: dict[str, Any] = {**dataset.env_kwargs, "obs_type": "pixels", "frame_size": frame_size}
+    env_kwargs: dict[str, Any] = {**dataset.env_kwargs, "obs_type": obs_type, "frame_size": frame_size}
     if camera:
         env_kwargs["camera"] = dict(camera)
     encoded = json.dumps(env_kwargs)
@@ -93,8 +97,8 @@ def render_dataset(
         states = (_states(dataset, episode, env.scene) for episode in left)
         drawn = map_in_order(functools.partial(_draw, encoded), states, n_workers)
         bar = tqdm(drawn, "rendering", dataset.n_episodes, initial=n_done, unit="episode", disable=not progress)
-        for episode, frames in zip(left, bar, strict=True):
-            writer.add_episode(frames, **_rest_of_episode(dataset, episode))
+        for episode, observations in zip(left, bar, strict=True):
+            writer.add_episode(observations, **_rest_of_episode(dataset, episode))
     return len(left)
 
 
@@ -134,6 +138,7 @@ def _provenance(dataset: OfflineDataset, env: Any) -> dict[str, Any]:
             digest.update(np.asarray(array[first : first + HASHED_ROWS]).tobytes())
     provenance = {
         "program": PROGRAM,
+        **({} if env.obs_type == "pixels" else {"obs_type": env.obs_type}),  # older files of images name none
         "frame_size": env.frame_size,
         "camera": env.camera,
         "renderer": env.get_render_device(),
@@ -167,18 +172,18 @@ def _states(dataset: OfflineDataset, episode: int, scene: TableScene) -> np.ndar
     return np.stack([scene.initial_state(states[0]), *states])
 
 
-def _draw(env_kwargs: str, states: np.ndarray) -> np.ndarray:
+def _draw(env_kwargs: str, states: np.ndarray) -> Any:
     """
     :param env_kwargs: arguments of the environment as JSON
     :param states: (n, 30) scene states
-    :return: (n, frame_size, frame_size, 3) uint8
+    :return: observations of these states, as rows
     """
     env = _shared_env(env_kwargs)
-    frames = []
+    observations = []
     for state in states:
         env.scene.set_state(state)
-        frames.append(env.get_frame())
-    return np.stack(frames)
+        observations.append(env.get_observation())
+    return stack_observations(observations)
 
 
 def _rest_of_episode(dataset: OfflineDataset, episode: int) -> dict[str, Any]:

@@ -203,9 +203,12 @@ def _examples(data: JoinedDatasets, summary: dict[str, Any], examples: Any) -> s
     lead = '<p class="note">Distance to the nearest observation of the data, in standard deviations:</p>'
     content = [lead, f'<div class="grid3">{"".join(charts)}</div>']
     name = image_name(data)
+    images = None
     if name is not None:
         observations = load_examples(examples, data.observation_space)
-        images = observations[name.removeprefix("observations/")] if isinstance(observations, dict) else observations
+        key = name.removeprefix("observations/")
+        images = observations.get(key) if isinstance(observations, dict) else observations  # examples may lack a key
+    if name is not None and images is not None:
         far = check["far"][: MOST_EXAMPLES // 2]
         shown = np.unique(np.linspace(0, len(images) - 1, MOST_EXAMPLES - len(far)).astype(int))
         space = subspaces(data.observation_space, "observations")[name]

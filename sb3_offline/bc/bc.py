@@ -27,6 +27,7 @@ class BC(OfflineAlgorithm):
     :param loss: ``"mse"``: squared error of the policy's mode (its standard deviation is fitted by likelihood), or
         ``"log_prob"``: likelihood of both
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
+    :param n_stack: number of frames that the policy sees at once, as SB3's ``VecFrameStack`` stacks them
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -55,6 +56,7 @@ class BC(OfflineAlgorithm):
         batch_size: int = 256,
         loss: str = "mse",
         random_shift: int = 0,
+        n_stack: int = 1,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -71,6 +73,7 @@ class BC(OfflineAlgorithm):
             learning_rate=learning_rate,
             batch_size=batch_size,
             random_shift=random_shift,
+            n_stack=n_stack,
             dataset_storage=dataset_storage,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,

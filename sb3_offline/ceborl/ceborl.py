@@ -1,6 +1,6 @@
 """CEBORL: Conservative Example-Based Offline RL."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch as th
@@ -101,6 +101,8 @@ class CEBORL(RecursiveClassifier):
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation; default: 4
         where there are images)
+    :param example_keys: keys of dict observations that the classifier sees, where examples show some keys only (default: those
+        that the examples hold)
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
@@ -157,6 +159,7 @@ class CEBORL(RecursiveClassifier):
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int | None = None,
+        example_keys: Sequence[str] | None = None,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -171,6 +174,7 @@ class CEBORL(RecursiveClassifier):
             dataset,
             examples,
             example_batch_size=example_batch_size,
+            example_keys=example_keys,
             example_share=example_share,
             initial_odds=initial_odds,
             ent_coef=ent_coef,

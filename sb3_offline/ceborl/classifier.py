@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
@@ -94,7 +95,10 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         own: dict[str, Any] = {"critic_output_bias": math.log(self.initial_odds)}
         if self._extraction.needs_state_head or self._backup.fits_state_head:
             own["critic_state_value"] = True
-        return {**own, **self._extraction.policy_kwargs(), **self.policy_kwargs}
+        own |= self._extraction.policy_kwargs()
+        if self.examples_lack_keys:  # the classifier sees what examples show, and the policy has an encoder of its own
+            own |= {"critic_keys": self.example_keys, "share_features_extractor": False}
+        return {**own, **self.policy_kwargs}
 
     def _open_data(self) -> None:
         super()._open_data()
@@ -115,10 +119,12 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
             examples, example_rows = self.sample_examples()
             examples = self.augment(examples)
             # One pass of the encoder for both: for a small batch, reading the weights takes longer than encoding its images
-            features, distinct_features = self.critic.encode(joined([observations, examples])).tensor_split([batch_size])
+            features, distinct_features = self.critic.encode(
+                joined([self.seen_in_examples(observations), examples])
+            ).tensor_split([batch_size])
             example_features = distinct_features[example_rows]
             with th.no_grad():
-                example_actions, _ = self.actor.sample(self._policy_features(examples, example_features, example_rows))
+                example_actions = self._example_actions(examples, example_features, example_rows, batch.actions)
                 discounted_omega = self._backup.discounted_omega(batch)
                 example_omega = None
                 if self.example_share > 0:  # the examples count among the data of term (c)
@@ -175,6 +181,23 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
         """
         return data_logits.new_zeros(())
 
+    def _example_actions(
+        self, examples: PyTorchObs, features: th.Tensor, rows: th.Tensor, data_actions: th.Tensor
+    ) -> th.Tensor:
+        """
+        Choose actions for the examples of term (b): the policy's. Where examples lack keys that the policy sees, it cannot be
+        asked, and actions of the dataset take the place of its own: an example counts as success with whatever is done there.
+
+        :param examples: distinct examples, shifted as in training
+        :param features: the critic's features of each place in the batch of examples, ``(example batch, features_dim)``
+        :param rows: for each place its row in ``examples``
+        :param data_actions: the dataset's actions of the batch, ``(batch, action_dim)``
+        :return: ``(example batch, action_dim)``
+        """
+        if self.examples_lack_keys:
+            return data_actions[th.randint(len(data_actions), (len(rows),), device=data_actions.device)]
+        return self.actor.sample(self._policy_features(examples, features, rows))[0]
+
     def _example_term(self, logits: th.Tensor, example_omega: th.Tensor | None) -> th.Tensor:
         """Term (b), and the examples' part of term (c), which bounds the odds by ``1 / example_share``."""
         loss = example_loss(logits, self.gamma, self.class_prior)
@@ -205,7 +228,14 @@ class RecursiveClassifier(ExampleBasedAlgorithm):
     def values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor | None:
         return self.critic.values(self.critic.encode(observations), actions).amin(dim=0).sigmoid()
 
+    def some_data_actions(self, n: int) -> th.Tensor:
+        """:return: ``(n, action_dim)`` actions of the dataset, the same ones each time"""
+        buffer = self.replay_buffer
+        return buffer.pairs(np.random.default_rng(0).integers(buffer.size(), size=n), self._vec_normalize_env)[1]
+
     def success_probabilities(self, observations: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor | None:
+        if actions is None and isinstance(observations, dict) and len(observations) < len(self.observation_space.spaces):  # type: ignore
+            actions = self.some_data_actions(len(next(iter(observations.values()))))  # examples, which the policy cannot see
         if actions is None:
             actions = self.policy._predict(observations, deterministic=True)  # type: ignore[arg-type]
         return self.values(observations, actions)

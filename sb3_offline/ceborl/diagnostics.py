@@ -99,7 +99,12 @@ class DiagnosticsCallback(BaseCallback):
         target_logits = model.critic_target.values(model.critic_target.encode(batch.observations), batch.actions)
         actions, values = self._policy_values(batch.observations, features)
         examples = model.all_examples()
-        _, example_values = self._policy_values(examples, model.critic.encode(examples))
+        example_features = model.critic.encode(examples)
+        if model.examples_lack_keys:  # the policy cannot be asked for its actions there
+            actions_there = model.some_data_actions(len(example_features))
+            example_values = model.critic.values(example_features, actions_there).mean(dim=0).float()
+        else:
+            _, example_values = self._policy_values(examples, example_features)
         found = {
             "classifier_saturated": logits.sigmoid() > SATURATED_CLASSIFIER,
             "omega_clipped": target_logits.amin(dim=0) >= math.log(model.omega_max),

@@ -11,7 +11,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes-per-task", type=int, default=300, help="number of attempts at each task (default: 300)")
     parser.add_argument("--table", default="paper", help="name of the environment's table: paper (default) or second")
     parser.add_argument("--tasks", nargs="+", help="tasks to attempt (default: all of the table)")
-    parser.add_argument("--obs-type", choices=("state", "pixels"), default="state", help="observations (default: state)")
+    parser.add_argument(
+        "--obs-type", choices=("state", "pixels", "both"), default="state", help="observations (default: state)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the collection (default: 0)")
     parser.add_argument(
         "--workers", type=int, default=2, help="number of processes, which does not change the file (default: 2)"

@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("output", type=Path, help="HDF5 file to write; an incomplete one is continued")
     parser.add_argument("--episodes-per-task", type=int, default=1500, help="number of attempts at each task (default: 1500)")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="tasks to attempt (default: all five)")
-    parser.add_argument("--obs-type", choices=("state", "pixels"), default="state", help="observations of the same episodes")
+    parser.add_argument(
+        "--obs-type", choices=("state", "pixels", "both"), default="state", help="observations of the same episodes"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the collection (default: 0)")
     parser.add_argument("--policies", type=Path, default=POLICIES, help="folder of select-sac (default: the shipped one)")
     parser.add_argument(

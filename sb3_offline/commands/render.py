@@ -9,6 +9,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """:param parser: parser of the command"""
     parser.add_argument("dataset", help="dataset file with the extra scene_state, of states or of frames")
     parser.add_argument("output", help="HDF5 file to write; one that an interrupted run left is continued")
+    parser.add_argument(
+        "--obs-type",
+        choices=("pixels", "both"),
+        default="pixels",
+        help="pixels: images alone (default); both: images and the state of the hand",
+    )
     parser.add_argument("--size", type=int, default=64, help="width and height of a frame in pixels (default: 64)")
     parser.add_argument("--azimuth", type=float, help="azimuth of the camera, in degrees")
     parser.add_argument("--elevation", type=float, help="elevation of the camera, in degrees; negative looks down")
@@ -26,6 +32,7 @@ def run(args: argparse.Namespace) -> None:
     n_drawn = render_dataset(
         args.dataset,
         args.output,
+        obs_type=args.obs_type,
         frame_size=args.size,
         camera={name: value for name, value in options.items() if value is not None},
         n_workers=args.workers,

@@ -51,10 +51,19 @@ def run(args: argparse.Namespace) -> None:
         eval_freq=args.eval_freq,
         n_eval_episodes=args.eval_episodes,
     )
-    read = [args.config, training.examples or config.get("examples"), *_files(training.dataset or config.get("dataset"))]
+    read = [
+        args.config,
+        *_examples(training.examples or config.get("examples")),
+        *_files(training.dataset or config.get("dataset")),
+    ]
     check_outputs([args.output / name for name in (MODEL_FILE, CONFIG_FILE, RESUME_FILE, "evaluations.csv")], read)
     train_run(training, verbose=1)
     print(f"Saved {args.output / MODEL_FILE}")
+
+
+def _examples(examples: Any) -> list[Any]:
+    """:return: the files of examples, of which a config may name one for each key"""
+    return list(examples.values()) if isinstance(examples, dict) else [examples]
 
 
 def _files(dataset: Any) -> list[str]:

@@ -65,7 +65,7 @@ def shift_observations(
     """
     Apply :func:`random_shift` to all images in a batch of observations. Vectors stay as they are.
 
-    :param observations: a batch, or a dict of batches
+    :param observations: a batch, or a dict of batches, of all keys of the space or of some
     :param space: space of one observation, images channel-first
     :param max_shift: largest shift in pixels
     :param rng: generator that draws the shifts
@@ -73,7 +73,7 @@ def shift_observations(
     :return: observations like the given ones
     """
     if isinstance(space, spaces.Dict):
-        parts = {key: (observations[key], space[key]) for key in space}  # type: ignore[index]
+        parts = {key: (observations[key], space[key]) for key in space if key in observations}  # type: ignore[index, operator]
         return {key: shift_observations(*part, max_shift, rng, float_images) for key, part in parts.items()}  # type: ignore
     is_image = is_image_space(space, normalized_image=float_images)
     return random_shift(observations, max_shift, rng) if is_image else observations  # type: ignore[arg-type]

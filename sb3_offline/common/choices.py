@@ -12,13 +12,14 @@ def counted_from_zero(observations: PyTorchObs, space: spaces.Space) -> PyTorchO
     """
     Count the choices of Discrete and MultiDiscrete spaces from 0. SB3's one-hot encoding ignores ``start``.
 
-    :param observations: a batch of observations of the space, or a dict of such
+    :param observations: a batch of observations of the space, or a dict of such. Keys that the space lacks are left out, so a
+        network that sees some keys only takes whole observations
     :param space: Observation space
     :return: the observations less ``start``; observations of other spaces stay as they are
     """
     if isinstance(observations, dict):
         assert isinstance(space, spaces.Dict)
-        return {key: _shifted(part, space[key]) for key, part in observations.items()}
+        return {key: _shifted(part, space[key]) for key, part in observations.items() if key in space.spaces}
     return _shifted(observations, space)
 
 

@@ -18,6 +18,7 @@ class Learner(Protocol):
     observation_space: Any
     action_space: Any
     device: Any
+    n_stack: int
     n_steps: Any
     gamma: float
     seed: Any
@@ -82,6 +83,7 @@ class LearningData:
             n_steps=learner.n_steps,
             gamma=learner.gamma,
             storage=learner.dataset_storage,
+            n_stack=learner.n_stack,
             next_actions=learner.needs_next_actions,
             seed=learner.seed,
         )

@@ -45,6 +45,22 @@ def normalizer_from(
     return normalizer
 
 
+def normalize_parts(normalizer: VecNormalize, observations: Any) -> Any:
+    """
+    :param normalizer: a ``VecNormalize``
+    :param observations: a batch of observations, or a dict of batches that may lack keys
+    :return: the normalised observations; those of ``normalize_obs`` if no key is missing
+    """
+    keys = normalizer.norm_obs_keys
+    if not (isinstance(observations, dict) and normalizer.norm_obs and keys and set(keys) - observations.keys()):
+        return normalizer.normalize_obs(observations)
+    rms: Any = normalizer.obs_rms
+    return {
+        key: normalizer._normalize_obs(part, rms[key]).astype(np.float32) if key in keys else part
+        for key, part in observations.items()
+    }
+
+
 def exceeds_clipping(observation: Any, statistics: NormalizerStatistics | VecNormalize) -> bool:
     """
     :param observation: an observation, a batch of these, or a dict of either

@@ -20,6 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_offline.common.augmentation import has_images, shift_observations
+from sb3_offline.common.frame_stack import saved_n_stack, stacked_env
 from sb3_offline.common.hyperparameters import COUNT, SHARE, WHOLE, Constraints, check_parameters
 from sb3_offline.common.learning_data import LearningData
 from sb3_offline.common.normalization import NormalizerStatistics, exceeds_clipping, normalizer_from, normalizes, statistics_of
@@ -29,6 +30,7 @@ from sb3_offline.common.stub_env import SpacesOnlyEnv
 from sb3_offline.data.buffer import OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetLike
+from sb3_offline.data.stacking import stacked_space
 
 SelfOfflineAlgorithm = TypeVar("SelfOfflineAlgorithm", bound="OfflineAlgorithm")
 
@@ -54,6 +56,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
     :param n_steps: length of the n-step windows that ``train()`` may use; windows never cross an episode
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels, edges repeated (0: no augmentation)
+    :param n_stack: number of frames that the policy sees at once, the last ones of the episode. An environment that is not in
+        SB3's ``VecFrameStack`` is put into one, and so is whatever the policy is evaluated in
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``, which maps the file where it does not fit in memory
     :param policy_kwargs: additional arguments to be passed to the policy on creation
     :param stats_window_size: kept for SB3's signature
@@ -74,6 +78,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         "n_steps": [COUNT],
         "target_update_interval": [COUNT],
         "random_shift": [WHOLE],
+        "n_stack": [COUNT],
     }
     #: what a hyperparameter search draws from
     search_space: ClassVar[SearchSpace] = LEARNING
@@ -92,6 +97,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         n_steps: int = 1,
         target_update_interval: int = 1,
         random_shift: int = 0,
+        n_stack: int = 1,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -103,7 +109,9 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self._data = LearningData(self)  # before SB3's constructor, which sets `replay_buffer`
         if env is None and dataset is not None:
             opened = self._data.datasets(dataset)[0]
-            env = SpacesOnlyEnv(opened.observation_space, opened.action_space)
+            env = SpacesOnlyEnv(stacked_space(opened.observation_space, n_stack), opened.action_space)
+        elif env is not None:
+            env = stacked_env(env, n_stack)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -131,6 +139,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         self.dataset_storage = dataset_storage
         self.target_update_interval = target_update_interval
         self.random_shift = random_shift
+        self.n_stack = n_stack
         self._sampler_state: dict[str, Any] | None = None
         # Of a saved model, until it goes on learning
         self._torch_rng_state: th.Tensor | None = None
@@ -195,6 +204,7 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
         """Called when the data are open, fitted and relabelled, before the first batch is drawn."""
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        env = stacked_env(env, self.n_stack)  # type: ignore[assignment]
         if self._data.buffer is not None:  # before the environment is replaced
             self._data.check_normalizer(unwrap_vec_normalize(env))  # type: ignore[arg-type]
         normalizer = self._vec_normalize_env
@@ -457,6 +467,8 @@ class OfflineAlgorithm(OffPolicyAlgorithm):
             other batches and actions
         :return: the model
         """
+        if env is not None:
+            env = stacked_env(env, saved_n_stack(path))  # type: ignore[assignment]
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])

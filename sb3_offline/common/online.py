@@ -37,7 +37,8 @@ def export_sac(
     observations are standardised as before.
 
     Critics that learned from rewards are kept. Critics that learned from examples do not estimate rewards, so SAC gets new
-    ones on the same encoder. A deterministic actor gets a standard deviation of 0.1 before the tanh.
+    ones on the same encoder; where that sees the keys of the examples only, on a copy of the policy's. A deterministic actor
+    gets a standard deviation of 0.1 before the tanh.
 
     :param model: trained actor-critic. If it learned with a ``VecNormalize``, that must be its environment, and SAC must be
         loaded with it too
@@ -60,7 +61,7 @@ def export_sac(
     if not 0 <= data_ratio <= 1:
         raise ValueError(f"data_ratio is {data_ratio}; give a share between 0 and 1")
     keeps_critic = isinstance(model, RewardBasedAlgorithm)
-    policy_kwargs = {k: v for k, v in model.all_policy_kwargs().items() if k != "critic_state_value"}
+    policy_kwargs = {k: v for k, v in model.all_policy_kwargs().items() if k not in ("critic_state_value", "critic_keys")}
     if not keeps_critic:
         policy_kwargs.pop("critic_output_bias", None)
     arguments = {name: getattr(model, name) for name in ("learning_rate", "batch_size", "tau", "gamma", "device")}
@@ -84,6 +85,8 @@ def export_sac(
             problem, remedy = "are missing, but SAC learns from them", "Give a dataset with rewards, or data_ratio=0"
             raise DatasetError(buffer.datasets[0].path, "rewards", problem, remedy)
         sac.replay_buffer_kwargs = {"dataset": model.dataset, "data_ratio": data_ratio}
+        if model.n_stack > 1:
+            sac.replay_buffer_kwargs["n_stack"] = model.n_stack
         if buffer.is_relabelled:  # SAC goes on with the rewards that the critic learned from.
             sac.replay_buffer_kwargs.update(rewards=buffer.rewards, checksum=buffer.checksum())
     sac.save(Path(path))
@@ -108,8 +111,12 @@ def _copy_weights(source: OfflinePolicy, target: OfflinePolicy, keeps_critic: bo
         target.actor.log_std.weight.zero_()  # type: ignore[union-attr, operator]
         target.actor.log_std.bias.fill_(th.tensor(ADDED_STD).log())  # type: ignore[union-attr, operator]
         weights = {name: value for name, value in weights.items() if not name.startswith(("actor.mu", "actor.log_std"))}
-    if not keeps_critic:
+    if source.critic_keys is not None:
+        weights = {name: value for name, value in weights.items() if name.startswith("actor.")}
+    elif not keeps_critic:
         weights = {name: value for name, value in weights.items() if not name.startswith(("critic.qf", "critic_target.qf"))}
     target.load_state_dict(weights, strict=False)
+    if source.critic_keys is not None:
+        target.critic.features_extractor.load_state_dict(target.actor.features_extractor.state_dict())
     if not keeps_critic:
         target.critic_target.load_state_dict(target.critic.state_dict())

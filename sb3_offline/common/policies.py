@@ -11,7 +11,7 @@ They are SB3's SAC policies with the differences that offline learning needs:
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -33,6 +33,7 @@ from sb3_offline.common.torch_layers import (
     fit_statistics,
     standardized_encoders,
 )
+from sb3_offline.data.spaces import subspace
 
 # Actions are clamped to this before atanh, which is infinite on the bounds, where actions of a dataset often lie
 ACTION_LIMIT = 0.999
@@ -271,6 +272,8 @@ class OfflinePolicy(SACPolicy):
     :param critic_layer_norm: put a LayerNorm after each hidden layer of the critics
     :param critic_output_bias: initial output of the critics, for all states and actions
     :param critic_state_value: add a critic that sees the state without an action
+    :param critic_keys: keys of dict observations that the critics see, in place of all. Their encoder then differs from the
+        actor's, which sees all keys, so ``share_features_extractor`` must be false: ``TypeError`` otherwise
     :param mixed_precision: compute matrix products and convolutions in bfloat16 when learning, or in float32; ``None`` takes
         bfloat16 if the device has instructions for it. Parameters, losses and the optimizers' states are always float32, and
         so is a policy that acts.
@@ -296,12 +299,17 @@ class OfflinePolicy(SACPolicy):
         critic_layer_norm: bool = False,
         critic_output_bias: float = 0.0,
         critic_state_value: bool = False,
+        critic_keys: Sequence[str] | None = None,
         mixed_precision: bool | None = None,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ):
         self.std_min, self.std_transform, self.actor_dropout = std_min, std_transform, actor_dropout
         self.mixed_precision = mixed_precision
+        self.critic_keys = critic_keys
+        if critic_keys is not None and share_features_extractor:
+            problem = f"the critics see {list(critic_keys)} only and the actor sees all keys, so they cannot share one encoder"
+            raise TypeError(f"{type(self).__name__}: {problem}; give share_features_extractor=False")
         self.offline_critic_kwargs: dict[str, Any] = {
             "layer_norm": critic_layer_norm,
             "output_bias": critic_output_bias,
@@ -353,7 +361,12 @@ class OfflinePolicy(SACPolicy):
         return actor.to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OfflineCritic:
-        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        critic_kwargs: dict[str, Any] = self.critic_kwargs
+        if self.critic_keys is not None:
+            seen = subspace(self.observation_space, self.critic_keys)
+            critic_kwargs = {**critic_kwargs, "observation_space": seen}
+            features_extractor = features_extractor or self.features_extractor_class(seen, **self.features_extractor_kwargs)
+        critic_kwargs = self._update_features_extractor(critic_kwargs, features_extractor)
         critic = OfflineCritic(**critic_kwargs, **self.offline_critic_kwargs)
         critic.mixed_precision = self.mixed_precision
         return critic.to(self.device)
@@ -365,6 +378,7 @@ class OfflinePolicy(SACPolicy):
             std_min=self.std_min,
             std_transform=self.std_transform,
             actor_dropout=self.actor_dropout,
+            critic_keys=self.critic_keys,
             mixed_precision=self.mixed_precision,
             **{f"critic_{name}": value for name, value in self.offline_critic_kwargs.items()},
         )

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import DatasetLike, OfflineDataset, open_datasets
 from sb3_offline.data.spaces import same_actions, subspaces
+from sb3_offline.data.stacking import frame_space, joined_frames, stack_axis
 from sb3_offline.data.storage import RowStore, observation_stores
 
 STATISTICS_BYTES = 1 << 24
@@ -94,6 +95,8 @@ class OfflineReplayBuffer(ReplayBuffer):
     :param gamma: discount of one step
     :param storage: "memory", "mmap" (contiguous files only), or "auto": the latter where the observations would take more than
         half of the available memory
+    :param n_stack: number of frames in an observation, as SB3's ``VecFrameStack`` stacks them: the last ones of the episode,
+        and zeros before its beginning. ``observation_space`` is then that of the stacks. Each frame is stored once
     :param next_actions: whether to give the dataset's next actions. The last step of an episode has no next action, so windows
         end at it, and it is its own successor. Thus a learner bootstraps only from pairs of observation and action that it
         also trains on. If the last steps were left out, their values would be bootstrapped but never trained
@@ -110,6 +113,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         n_steps: int = 1,
         gamma: float = 0.99,
         storage: Literal["auto", "memory", "mmap"] = "auto",
+        n_stack: int = 1,
         next_actions: bool = False,
         seed: int | None = None,
     ):
@@ -121,8 +125,9 @@ class OfflineReplayBuffer(ReplayBuffer):
         BaseBuffer.__init__(self, max(n_steps_total, 1), observation_space, action_space, device)
         self.full, self.optimize_memory_usage, self.handle_timeout_termination = True, False, False
         self.n_steps, self.gamma, self.next_actions = n_steps, gamma, next_actions
-        self.datasets = datasets
-        self._transposed = _match_observations(datasets[0], observation_space)
+        self.datasets, self.n_stack = datasets, n_stack
+        self._frame_space = frame_space(observation_space, n_stack)
+        self._transposed = _match_observations(datasets[0], self._frame_space)
         if not same_actions(datasets[0].action_space, action_space):
             problem = f"is {datasets[0].action_space}, but the learner has {action_space}"
             remedy = "Use the environment that the data were collected in"
@@ -146,6 +151,9 @@ class OfflineReplayBuffer(ReplayBuffer):
         n, starts = int(lengths.sum()), np.cumsum(lengths) - lengths
         step = np.arange(n)
         self._observation_rows = step + np.repeat(np.arange(len(lengths)), lengths)
+        if self.n_stack > 1:  # the number of earlier frames of the episode, for each row of observations
+            first_rows = starts + np.arange(len(lengths))
+            self._earlier_frames = np.arange(n + len(lengths)) - np.repeat(first_rows, lengths + 1)
         # The number of steps that a window may go ahead: 0 only at last steps, if next actions are asked for
         self._steps_left = np.repeat(starts + lengths, lengths) - step - int(self.next_actions)
         if n == 0:
@@ -289,12 +297,26 @@ class OfflineReplayBuffer(ReplayBuffer):
     def _observations(self, rows: np.ndarray, env: VecNormalize | None) -> Observations:
         parts = {}
         for name, space in subspaces(self.observation_space, "observations").items():
-            parts[name.removeprefix("observations/")] = self._wrap(name, self._stores[name].take(rows), space)
+            stored = self._stores[name].take(rows) if self.n_stack == 1 else self._stacks(name, rows)
+            parts[name.removeprefix("observations/")] = self._wrap(name, stored, space)
         if env is not None:
             normalized = env.normalize_obs(parts if isinstance(self.observation_space, spaces.Dict) else parts["observations"])
             parts = normalized if isinstance(normalized, dict) else {"observations": normalized}
         tensors = {key: self._to_device(array) for key, array in parts.items()}
         return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observations"]
+
+    def _stacks(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """:return: the stacks that end in rows of observations, in the layout of the file"""
+        back = np.arange(self.n_stack - 1, -1, -1)
+        is_inside = back <= self._earlier_frames[rows][:, None]
+        frame_rows = rows[:, None] - np.where(is_inside, back, 0)  # a frame before the episode is blank, so any row will do
+        frames = self._stores[name].take(frame_rows.ravel())
+        frames = frames.reshape(*frame_rows.shape, *frames.shape[1:])
+        frames[~is_inside] = 0
+        return joined_frames(frames, -1 if name in self._transposed else self._stack_axis(name))
+
+    def _stack_axis(self, name: str) -> int:
+        return stack_axis(subspaces(self._frame_space, "observations")[name])  # type: ignore[arg-type]
 
     def _wrap(self, name: str, array: np.ndarray, space: spaces.Space) -> np.ndarray:
         """:return: rows of a file in the layout and dtype of the learner's space; images become channel-first as a view"""
@@ -379,9 +401,9 @@ class OfflineReplayBuffer(ReplayBuffer):
 
         :param keys: keys of a Dict space (default: all)
         :return: (mean, variance, count), with mean and variance float64 of the learner's shape; a dict of these for a Dict
-            space
+            space. Stacked frames all have the moments of the frames: the blank ones at the beginning do not count
         """
-        plain = subspaces(self.observation_space, "observations")
+        plain = subspaces(self._frame_space, "observations")
         names = {n.removeprefix("observations/"): n for n in plain}
         moments = {key: self._moments(n, self._stores[n], plain[n]) for key, n in names.items() if not keys or key in keys}
         return moments if isinstance(self.observation_space, spaces.Dict) else moments["observations"]
@@ -397,7 +419,11 @@ class OfflineReplayBuffer(ReplayBuffer):
                 squares = squares + ((piece - piece.mean(axis=0)) ** 2).sum(axis=0) + delta**2 * count * len(piece) / total
                 mean = mean + delta * len(piece) / total
                 count = total
-        return mean, squares / count, count
+        variance = squares / count
+        if self.n_stack > 1:
+            frames = (np.repeat(moment[None, None], self.n_stack, axis=1) for moment in (mean, variance))
+            mean, variance = (joined_frames(part, self._stack_axis(name))[0] for part in frames)
+        return mean, variance, count
 
     def checksum(self) -> int:
         """:return: a checksum of all actions, an identifier of the data"""
@@ -412,7 +438,8 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.rng.bit_generator.state = state
 
     def __getstate__(self) -> dict[str, Any]:
-        options = {"n_steps": self.n_steps, "gamma": self.gamma, "storage": self.storage, "next_actions": self.next_actions}
+        names = ("n_steps", "gamma", "storage", "n_stack", "next_actions")
+        options = {name: getattr(self, name) for name in names}
         arguments = (self.datasets, self.observation_space, self.action_space, str(self.device))
         rewards = self.rewards if self.is_relabelled else None  # no file holds relabelled rewards
         return {"arguments": arguments, "options": options, "rng_state": self.get_rng_state(), "rewards": rewards}

@@ -4,7 +4,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from gymnasium import spaces
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import WriteLock, open_hdf5, replacing
 from sb3_offline.data.plain import check_all_plain, check_stored, is_text, read_attribute
-from sb3_offline.data.spaces import check_observations, space_to_json, to_array
+from sb3_offline.data.spaces import check_observations, space_to_json, subspace, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
 EXAMPLES_VERSION = 1
@@ -24,40 +24,38 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 
 Observations = np.ndarray | dict[str, np.ndarray]
+#: Whatever is accepted where success examples are asked for
+ExamplesLike = str | os.PathLike | np.ndarray | Mapping[str, Any]
 
 
-def load_examples(
-    examples: str | os.PathLike | np.ndarray | Mapping[str, np.ndarray], observation_space: spaces.Space
-) -> Observations:
+def load_examples(examples: ExamplesLike, observation_space: spaces.Space, keys: Sequence[str] | None = None) -> Observations:
     """
     Read success examples as observations of a space.
+
+    For a Dict space, examples may show success by some of its keys only: as a dict or an ``.npz`` or HDF5 file with an array
+    for each of these keys; as a dict whose values are paths, such as a folder of images for each key; or as one folder or
+    array, where it is clear which key it belongs to: images to the only key of images, any array to the only key of its shape.
 
     :param examples: an array or a dict of arrays, or the path of one of these: a file of ``save_examples``; an ``.npz``
         file with ``observations`` or a single array (for a Dict space, with an array for each key); a ``.npy`` file; a folder
         of PNG or JPEG images. Images are taken in the order of their names, and each is resized as a whole: crop images of
         other proportions first
     :param observation_space: a Box or a Dict. Images may be channel-last or channel-first, both here and in the examples
+    :param keys: the keys of a Dict space to read; the examples may hold others beside them (default: those that the examples
+        hold)
     :return: ``(n, *shape)`` of the space's dtype, or a dict of such arrays
-    :raises DatasetError: if there is no example, or if shape, dtype or range do not fit the space
+    :raises DatasetError: if there is no example, if shape, dtype or range do not fit the space, if a key is missing, or if it
+        is not clear which key an array belongs to
     """
-    value: Any = examples
-    file: str | os.PathLike = ""
-    if isinstance(examples, str | os.PathLike):
-        file = path = Path(examples).expanduser()
-        if path.is_dir():
-            value = _read_images(path, observation_space)
-        elif path.suffix in (".npz", ".npy"):
-            value = _read_numpy(path, observation_space)
-        else:
-            value = _read_hdf5(path)
-    if isinstance(value, Mapping) and isinstance(observation_space, spaces.Dict):
-        plain = observation_space.spaces
-        value = {
-            key: _match_layout(to_array(part, file, f"examples/{key}"), plain[key]) if key in plain else part
-            for key, part in value.items()
-        }
-    elif not isinstance(value, Mapping):
-        value = _match_layout(to_array(value, file, "examples"), observation_space)
+    file: str | os.PathLike = Path(examples).expanduser() if isinstance(examples, str | os.PathLike) else ""
+    value: Any
+    if isinstance(observation_space, spaces.Dict):
+        value = _by_key(examples, file, observation_space, keys)
+        observation_space = subspace(observation_space, list(value))
+    else:
+        value = _read(examples, file, observation_space)
+        if not isinstance(value, Mapping):
+            value = _match_layout(to_array(value, file, "examples"), observation_space)
     arrays = check_observations(value, observation_space, None, file, "examples")
     n = len(next(iter(arrays.values())))
     for name, array in arrays.items():
@@ -70,6 +68,11 @@ def load_examples(
             remedy = "Multiply them by 255 before casting to uint8"
             raise DatasetError(file, name, "holds only the values 0 and 1", remedy)
     if isinstance(observation_space, spaces.Dict):
+        held = list(observation_space.spaces)
+        if missing := [key for key in keys or [] if key not in held]:
+            problem = f"hold {held} and lack {missing}, by which the learner knows success"
+            remedy = "Give an array for each key, or make a model that knows success by these: example_keys=[...]"
+            raise DatasetError(file, "examples", problem, remedy)
         return {name.removeprefix("examples/"): array for name, array in arrays.items()}
     return arrays["examples"]
 
@@ -83,6 +86,55 @@ def examples_checksum(examples: Observations) -> int:
     for array in examples.values() if isinstance(examples, dict) else [examples]:
         checksum = zlib.crc32(array.tobytes(), checksum)
     return checksum
+
+
+def _read(examples: Any, file: str | os.PathLike, space: spaces.Space) -> Any:
+    """:return: the examples in their own form: an array, or a dict of arrays or of more paths"""
+    if not isinstance(file, Path):
+        return examples
+    if file.is_dir():
+        return _read_images(file, space)
+    return _read_numpy(file, space) if file.suffix in (".npz", ".npy") else _read_hdf5(file)
+
+
+def _by_key(examples: Any, file: str | os.PathLike, space: spaces.Dict, keys: Sequence[str] | None) -> dict[str, np.ndarray]:
+    """:return: the examples by key, in the order of the space"""
+    parts = space.spaces if keys is None else subspace(space, keys).spaces
+    value: Any
+    if isinstance(file, Path) and file.is_dir():
+        key = _only_key([key for key, part in parts.items() if _takes_images(part)], file, "images", parts)
+        value = {key: _read_images(file, space[key])}
+    else:
+        value = _read(examples, file, space)
+    if isinstance(value, Mapping) and not value.keys() & space.spaces.keys() and len(value) == 1:
+        (value,) = value.values()  # one array, under a name of its own
+    if not isinstance(value, Mapping):
+        array = to_array(value, file, "examples")
+        fitting = [key for key, part in parts.items() if _match_layout(array, part).shape[1:] == tuple(part.shape or ())]
+        value = {_only_key(fitting, file, f"one array of shape {array.shape}", parts): array}
+    if unknown := sorted(map(str, value.keys() - space.spaces.keys())):
+        problem = f"are {sorted(map(str, value))}, but the observation space has no {unknown}"
+        raise DatasetError(file, "examples", problem, f"Name the arrays as the space does: {list(space.spaces)}")
+    return {key: _part(value[key], file, key, part) for key, part in parts.items() if key in value}
+
+
+def _part(value: Any, file: str | os.PathLike, key: str, space: spaces.Space) -> np.ndarray:
+    """:return: the examples of one key, which may be in a file of their own"""
+    if isinstance(value, str | os.PathLike):
+        return np.asarray(load_examples(value, space))
+    return _match_layout(to_array(value, file, f"examples/{key}"), space)
+
+
+def _only_key(candidates: Sequence[str], file: str | os.PathLike, what: str, parts: Mapping[str, spaces.Space]) -> str:
+    if len(candidates) == 1:
+        return candidates[0]
+    which = f"which {'may belong to any of ' + str(list(candidates)) if candidates else 'fit no key'} of {dict(parts)}"
+    remedy = "Say which one: examples={'KEY': ...}, or example_keys=['KEY']"
+    raise DatasetError(file, "examples", f"hold {what}, {which}", remedy)
+
+
+def _takes_images(space: spaces.Space) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
 
 
 def save_examples(
@@ -177,10 +229,10 @@ def _read_images(folder: Path, space: spaces.Space) -> np.ndarray:
     """:return: (n, height, width, channels) uint8"""
     from PIL import Image, ImageOps
 
-    if not (isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3):
+    if not _takes_images(space):
         problem = f"holds images, but the observation space is {space}"
         raise DatasetError(folder, "examples", problem, "A folder of images needs a space of uint8 images")
-    height, width, channels = _channels_last(space.shape)
+    height, width, channels = _channels_last(tuple(space.shape or ()))  # type: ignore[arg-type]
     mode = {1: "L", 3: "RGB"}.get(channels)
     if mode is None:
         problem = f"holds single images, but an observation has {channels} channels"

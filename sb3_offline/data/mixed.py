@@ -18,6 +18,7 @@ class _Mixed:
         *args: Any,
         dataset: DatasetLike,
         data_ratio: float = 0.5,
+        n_stack: int = 1,
         rewards: np.ndarray | None = None,
         checksum: int | None = None,
         **kwargs: Any,
@@ -28,7 +29,7 @@ class _Mixed:
         self.data_ratio = data_ratio
         seed = np.random.randint(2**31)  # SB3 seeds NumPy's generator, which its own buffers draw from
         learner = self.observation_space, self.action_space, self.device  # type: ignore[attr-defined]
-        self.offline = OfflineReplayBuffer(dataset, *learner, seed=seed)
+        self.offline = OfflineReplayBuffer(dataset, *learner, n_stack=n_stack, seed=seed)
         if rewards is not None:
             if len(rewards) != self.offline.size() or checksum not in (None, self.offline.checksum()):
                 problem = f"are of other data: {len(rewards)} rewards, and the dataset has {self.offline.size()} steps"
@@ -64,6 +65,7 @@ class MixedReplayBuffer(_Mixed, ReplayBuffer):
     :param dataset: path, glob pattern, ``OfflineDataset``, or a sequence of these. It needs rewards unless ``rewards`` is
         given
     :param data_ratio: share of each batch that comes from the dataset
+    :param n_stack: number of frames that the environment's ``VecFrameStack`` stacks
     :param rewards: (steps,) float32, rewards that replace the dataset's
     :param checksum: checksum of the data that ``rewards`` belong to (:meth:`OfflineReplayBuffer.checksum
         <sb3_offline.data.buffer.OfflineReplayBuffer.checksum>`); other data raise ``DatasetError``

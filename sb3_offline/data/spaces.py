@@ -5,7 +5,7 @@ import math
 import operator
 import os
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,6 +99,16 @@ def subspaces(space: spaces.Space, name: str) -> dict[str, spaces.Space]:
     return {name: space}
 
 
+def subspace(space: spaces.Space, keys: Sequence[str]) -> spaces.Dict:
+    """
+    :param space: a Dict space
+    :param keys: some of its keys
+    :return: the Dict space of these keys, in the order that they have in ``space``
+    """
+    assert isinstance(space, spaces.Dict)
+    return spaces.Dict(OrderedDict((key, part) for key, part in space.spaces.items() if key in keys))
+
+
 def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
     """
     :param space: an action space
@@ -109,6 +119,16 @@ def same_actions(space: spaces.Space, other: spaces.Space) -> bool:
         one, two = (np.array([box.low, box.high], np.float32) for box in (space, other))
         return np.array_equal(one, two)
     return space == other
+
+
+def stack_observations(observations: Sequence[Any]) -> Any:
+    """
+    :param observations: single observations of a space
+    :return: array of these as rows; a dict of such arrays for a Dict space
+    """
+    if isinstance(observations[0], Mapping):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)
 
 
 def check_observations(

@@ -83,7 +83,7 @@ class DCQL(ExampleBasedAlgorithm, CQL):
 
     def relabel(self, buffer: OfflineReplayBuffer) -> None:
         statistics = None if self._observations_normalized else self.replay_buffer.observation_statistics
-        vectors = ObservationVectors(self.observation_space, statistics)
+        vectors = ObservationVectors(self.example_space, statistics)
         goals = vectors(self.all_examples())
 
         def reward(batch: OfflineSamples) -> th.Tensor:

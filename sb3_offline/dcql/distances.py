@@ -17,7 +17,7 @@ class ObservationVectors:
     Observations as vectors. Images are scaled to [0, 1], vectors are standardised by the dataset's mean and standard
     deviation, and discrete observations are one-hot. The entries of a dict are concatenated.
 
-    :param space: Observation space, images channel-first
+    :param space: Observation space, images channel-first. Of dict observations, only the keys of this space count
     :param statistics: function that returns (mean, variance, count) of the dataset's observations, or a dict of these for the
         given keys of dict observations; ``None`` if observations are normalised already
     """

@@ -39,7 +39,9 @@ def judge_trajectories(model: RecursiveClassifier, dataset: OfflineDataset) -> J
     :param dataset: labelled episodes of equal length, with the extra ``scene_state``
     :return: the trajectories with the odds of every decision
     """
-    buffer = OfflineReplayBuffer(dataset, model.observation_space, model.action_space, device=model.device)
+    buffer = OfflineReplayBuffer(
+        dataset, model.observation_space, model.action_space, device=model.device, n_stack=model.n_stack
+    )
     batches = []
     for indices in np.array_split(np.arange(buffer.size()), max(buffer.size() // 512, 1)):
         samples = buffer.transitions(indices)

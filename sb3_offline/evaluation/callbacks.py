@@ -1,5 +1,6 @@
 """A callback that evaluates a model on held-out data."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_offline.common.callbacks import log_at_once
-from sb3_offline.common.example_based import ExamplesLike
+from sb3_offline.common.example_based import ExampleBasedAlgorithm, ExamplesLike
+from sb3_offline.common.normalization import normalize_parts
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.examples import load_examples
@@ -65,7 +67,12 @@ class OfflineEvalCallback(BaseCallback):
             self.buffer = model.replay_buffer.single_steps()
         else:
             self.buffer = OfflineReplayBuffer(
-                self.dataset, model.observation_space, model.action_space, model.device, gamma=model.gamma
+                self.dataset,
+                model.observation_space,
+                model.action_space,
+                model.device,
+                gamma=model.gamma,
+                n_stack=model.n_stack,
             )
             model.relabel(self.buffer)
         size = self.buffer.size()
@@ -73,9 +80,11 @@ class OfflineEvalCallback(BaseCallback):
         self.indices = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
         self.example_observations: PyTorchObs | None = None
         if self.examples is not None:
-            arrays = load_examples(self.examples, model.observation_space)
+            knows_examples = isinstance(model, ExampleBasedAlgorithm)  # their keys, and how many frames it stacks
+            read = model.load_examples if knows_examples else partial(load_examples, observation_space=model.observation_space)
+            arrays: Any = read(self.examples)
             if model._vec_normalize_env is not None:
-                arrays = model._vec_normalize_env.normalize_obs(arrays)
+                arrays = normalize_parts(model._vec_normalize_env, arrays)
             if isinstance(arrays, dict):
                 self.example_observations = {key: th.as_tensor(array, device=model.device) for key, array in arrays.items()}
             else:

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_offline.common.offline_algorithm import OfflineAlgorithm
 
@@ -55,14 +55,21 @@ def success_interval(successes: int, episodes: int) -> tuple[float, float]:
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
-def make_evaluation_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> VecEnv:
+def make_evaluation_env(env_id: str, env_kwargs: dict[str, Any], seed: int, n_stack: int = 1) -> VecEnv:
     """
     :param env_id: registered id of the environment
     :param env_kwargs: keyword arguments of the environment
     :param seed: seed of its episodes; the same seed gives the same initial states
-    :return: a vectorized environment of one, with SB3's ``Monitor``
+    :param n_stack: number of frames that the policy sees at once
+    :return: a vectorized environment of one, with SB3's ``Monitor``, and in a ``VecFrameStack`` for more than one frame
     """
-    return make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
+    env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
+    return VecFrameStack(env, n_stack) if n_stack > 1 else env
+
+
+def frames_seen_by(model: Any) -> int:
+    """:return: the number of frames that a model or a policy sees at once"""
+    return getattr(model, "n_stack", 1)
 
 
 class PlainObservationPredictor:
@@ -110,7 +117,7 @@ def evaluate_success(
     if n_episodes < 1:
         raise ValueError(f"n_episodes is {n_episodes}; play at least one")
     player = PlainObservationPredictor(model)
-    env = make_evaluation_env(env_id, env_kwargs, seed)
+    env = make_evaluation_env(env_id, env_kwargs, seed, frames_seen_by(model))
     successes: list[bool] = []
     solved = False
 

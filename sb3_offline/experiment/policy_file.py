@@ -35,6 +35,7 @@ def save_policy(path: Path, model: OfflineAlgorithm, config: dict[str, Any]) -> 
         weights[name], weights[name + _UNIT] = (weights[name] / unit).round().astype(np.int8), unit
     description = {
         **{key: config[key] for key in _KEPT if key in config},
+        **({"n_stack": model.n_stack} if model.n_stack > 1 else {}),
         "observation_space": space_to_json(model.observation_space),
         "action_space": space_to_json(model.action_space),
     }
@@ -60,5 +61,6 @@ def load_policy(path: Path) -> tuple[BasePolicy, dict[str, Any]]:
     model = create_model(algo, kwargs, dataset=None, env=SpacesOnlyEnv(*spaces))
     for name in [name for name in arrays if name + _UNIT in arrays]:
         arrays[name] = arrays[name] * arrays.pop(name + _UNIT)
+    model.policy.n_stack = config.get("n_stack", 1)  # the number of frames that whoever plays it has to stack
     model.actor.load_state_dict({name: th.as_tensor(array) for name, array in arrays.items()})
     return model.policy, config

@@ -9,7 +9,8 @@ from PIL import Image, ImageDraw
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from sb3_offline.data.files import replacing
-from sb3_offline.experiment.evaluation import EVALUATION_SEED, PlainObservationPredictor
+from sb3_offline.data.stacking import EpisodeStack
+from sb3_offline.experiment.evaluation import EVALUATION_SEED, PlainObservationPredictor, frames_seen_by
 
 FRAME_MS = 80
 LAST_FRAME_MS = 800
@@ -25,12 +26,13 @@ def record_episode(model: PolicyPredictor, env: gym.Env, seed: int | None = None
     :return: frames uint8, before the first decision and after each; and the index of the decision that solved the task, or
         ``None``
     """
-    observation, _ = env.reset(seed=seed)
-    player = PlainObservationPredictor(model)
+    player, stack = PlainObservationPredictor(model), EpisodeStack(env.observation_space, frames_seen_by(model))
+    observation = stack.reset(env.reset(seed=seed)[0])
     frames, solved_at, solved_for, done = [env.render()], None, 0, False
     while not done and solved_for < 5:
         action, _ = player.predict(observation, deterministic=True)
-        observation, _, terminated, truncated, info = env.step(action)
+        frame, _, terminated, truncated, info = env.step(action)
+        observation = stack.add(frame)
         frames.append(env.render())
         done = terminated or truncated
         solved_for += bool(info.get("is_success"))

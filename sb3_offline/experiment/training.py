@@ -138,6 +138,8 @@ def create_model(
     arguments = {key: value for key, value in config.items() if key not in ("n_timesteps", "env_kwargs", *DATA_ENTRIES)}
     data = data_arguments(config, dataset, examples, takes_examples=learns_from_examples(algo))
     arguments = {**arguments, "env": None, **data, "seed": seed, **kwargs}
+    if "frame_stack" in arguments:  # the RL Zoo's name
+        arguments["n_stack"] = arguments.pop("frame_stack")
     if isinstance(arguments.get("learning_rate"), str):
         arguments["learning_rate"] = _schedule(arguments["learning_rate"])
     try:
@@ -296,7 +298,7 @@ def _check_registered(env_id: str) -> None:
 def _check_playable(model: OfflineAlgorithm, env_id: str, env_kwargs: dict[str, Any]) -> None:
     """Raise an error before the model learns if it cannot play in the environment to evaluate it in."""
     try:
-        env = make_evaluation_env(env_id, env_kwargs, seed=0)
+        env = make_evaluation_env(env_id, env_kwargs, seed=0, n_stack=model.n_stack)
         try:
             env.step(model.predict(env.reset(), deterministic=True)[0])  # type: ignore[arg-type]
         finally:

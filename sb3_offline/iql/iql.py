@@ -39,6 +39,7 @@ class IQL(RewardBasedAlgorithm):
     :param reward_fn: rewards in place of the dataset's, see
         :class:`~sb3_offline.common.reward_based.RewardBasedAlgorithm`
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
+    :param n_stack: number of frames that the policy sees at once, as SB3's ``VecFrameStack`` stacks them
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -76,6 +77,7 @@ class IQL(RewardBasedAlgorithm):
         target_update_interval: int = 1,
         reward_fn: RewardFunction | None = None,
         random_shift: int = 0,
+        n_stack: int = 1,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -97,6 +99,7 @@ class IQL(RewardBasedAlgorithm):
             n_steps=n_steps,
             target_update_interval=target_update_interval,
             random_shift=random_shift,
+            n_stack=n_stack,
             dataset_storage=dataset_storage,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,

@@ -93,10 +93,11 @@ class ORIL(ExampleBasedAlgorithm, CQL):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        space = self.example_space  # the keys by which success is known
         self.reward_model = RewardClassifier(
-            self.observation_space,
+            space,
             self.action_space,
-            features_extractor=self.policy.make_features_extractor(),
+            features_extractor=self.policy.features_extractor_class(space, **self.policy.features_extractor_kwargs),
             net_arch=self.policy.critic_kwargs["net_arch"],  # type: ignore[arg-type]
             normalize_images=self.policy.normalize_images,
         ).to(self.device)
@@ -110,8 +111,8 @@ class ORIL(ExampleBasedAlgorithm, CQL):
     def _train_reward_model(self) -> None:
         model, encoder = self.reward_model, self.reward_model.features_extractor
         assert encoder is not None
-        for name, statistics in self.critic.features_extractor.named_buffers():  # of the dataset, for vectors
-            encoder.get_buffer(name).copy_(statistics)
+        for name, statistics in encoder.named_buffers():  # of the dataset, for vectors
+            statistics.copy_(self.critic.features_extractor.get_buffer(name))
         model.set_training_mode(True)
         optimizer = th.optim.Adam(model.parameters(), lr=self.reward_learning_rate)
         for _ in range(self.reward_steps):

@@ -1,5 +1,6 @@
 """RCE: Recursive Classification of Examples, on a fixed dataset."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import torch as th
@@ -43,6 +44,9 @@ class RCE(RecursiveClassifier):
     :param ent_coef: Entropy coefficient
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param random_shift: images are shifted by up to so many pixels, alike in groups of 32 (0: no augmentation)
+    :param example_keys: keys of dict observations that the classifier sees, where examples show some keys only (default: those
+        that the examples hold)
+    :param n_stack: number of frames that the policy sees at once, as SB3's ``VecFrameStack`` stacks them
     :param dataset_storage: ``"memory"``, ``"mmap"``, or ``"auto"``
     :param stats_window_size: kept for SB3's signature
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -72,6 +76,8 @@ class RCE(RecursiveClassifier):
         ent_coef: float = 1e-4,
         target_update_interval: int = 1,
         random_shift: int = 0,
+        example_keys: Sequence[str] | None = None,
+        n_stack: int = 1,
         dataset_storage: Literal["auto", "memory", "mmap"] = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -87,6 +93,7 @@ class RCE(RecursiveClassifier):
             dataset,
             examples,
             example_batch_size=example_batch_size,
+            example_keys=example_keys,
             example_share=example_share,
             initial_odds=initial_odds,
             ent_coef=ent_coef,
@@ -97,6 +104,7 @@ class RCE(RecursiveClassifier):
             n_steps=n_steps,
             target_update_interval=target_update_interval,
             random_shift=random_shift,
+            n_stack=n_stack,
             dataset_storage=dataset_storage,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,

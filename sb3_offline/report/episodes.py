@@ -44,7 +44,7 @@ class _Watched:
     """Plays like a model, and keeps the value of each state and action: the lowest of its critics."""
 
     def __init__(self, model: OfflineAlgorithm):
-        self.model = model
+        self.model, self.n_stack = model, model.n_stack
         self.values: list[float] = []
         self._normalizer = model.observation_normalizer()
 

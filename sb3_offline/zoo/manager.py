@@ -51,6 +51,9 @@ class OfflineExperimentManager(ExperimentManager):
                 own = hyperparams.get("policy_kwargs", {})
                 own = python_value(own) if isinstance(own, str) else own
                 hyperparams["policy_kwargs"] = {**own, **self._drawn_policy_kwargs}
+            if "n_stack" in hyperparams:  # the Zoo stacks frames of training and evaluation by its own name for it
+                hyperparams["frame_stack"] = hyperparams.pop("n_stack")
+                saved_hyperparams.pop("n_stack", None)
             saved_hyperparams.update(hyperparams)
         env_kwargs = {**hyperparams.get("env_kwargs", {}), **given}
         hyperparams["env_kwargs"] = saved_hyperparams["env_kwargs"] = self.args.env_kwargs = env_kwargs
@@ -71,9 +74,11 @@ class OfflineExperimentManager(ExperimentManager):
                 raise RuntimeError(f"{self.config}: names no dataset for {self.env_name.gym_id}; {remedy}")
             datasets = open_datasets(hyperparams["dataset"])
             if hyperparams.get("examples") is not None:
-                load_examples(hyperparams["examples"], datasets[0].observation_space)
+                load_examples(hyperparams["examples"], datasets[0].observation_space, hyperparams.get("example_keys"))
         hyperparams, *rest = super()._preprocess_hyperparams(hyperparams)
         if self.algo in sb3_offline.ALGOS:
+            if self.frame_stack is not None:
+                hyperparams["n_stack"] = self.frame_stack
             policy_kwargs = hyperparams.setdefault("policy_kwargs", {})
             HYPERPARAMS_SAMPLER[self.algo] = partial(
                 sample_params, sb3_offline.ALGOS[self.algo].search_space, policy_kwargs=policy_kwargs

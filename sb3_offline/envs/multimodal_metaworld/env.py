@@ -12,17 +12,20 @@ from gymnasium import spaces
 from sb3_offline.envs.multimodal_metaworld.judges import make_judges
 from sb3_offline.envs.multimodal_metaworld.rendering import CAMERAS, FRAME_SIZE, SceneRenderer
 from sb3_offline.envs.multimodal_metaworld.scene import TableScene
-from sb3_offline.envs.multimodal_metaworld.state import StateReader
+from sb3_offline.envs.multimodal_metaworld.state import HAND_NAMES, StateReader
 from sb3_offline.envs.multimodal_metaworld.tables import find_table
 
 EPISODE_LENGTH = 50
 """Decisions in an episode by default."""
 
+OBS_TYPES = ("pixels", "state", "both")
+"""What an environment may observe."""
+
 DEFAULT_TASK = "door-open"
 """The default task of a table that has it. Another table's default task is its first."""
 
 
-class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
+class MultimodalMetaworldEnv(gym.Env[Any, np.ndarray]):
     """
     Several Meta-World tasks around one arm, as in the CEBORL paper. Every task of a table begins alike, and neither images nor
     states tell which one is meant; `task` only chooses the reward and `info["success"]`.
@@ -31,7 +34,8 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
     state at the end. An episode never terminates and is truncated after `episode_length` decisions.
 
     :param task: one of the table's tasks (default: "door-open" where the table has it, else the first)
-    :param obs_type: "pixels" for (frame_size, frame_size, 3) uint8 images, "state" for the float32 vector `state_names`
+    :param obs_type: "pixels" for (frame_size, frame_size, 3) uint8 images, "state" for the float32 vector `state_names`,
+        "both" for a dict of such an `image` and of the `hand`: the entries of the state that a robot knows of itself
     :param render_mode: "rgb_array" or None
     :param episode_length: decisions in an episode
     :param action_repeat: control steps of 12.5 ms in a decision
@@ -67,8 +71,8 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             task = DEFAULT_TASK if DEFAULT_TASK in self.tasks else self.tasks[0]
         if task not in self.tasks:
             raise ValueError(f"Table {table!r} has no task {task!r}; choose one of {', '.join(self.tasks)}.")
-        if obs_type not in ("pixels", "state"):
-            raise ValueError(f'Unknown obs_type {obs_type!r}; choose "pixels" or "state".')
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"Unknown obs_type {obs_type!r}; choose one of {', '.join(OBS_TYPES)}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'Unknown render_mode {render_mode!r}; choose "rgb_array" or None.')
         if frame_size < 1:
@@ -94,13 +98,16 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
 
         self._state = StateReader(self.scene.model, self.scene.data, self.table.state)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self.observation_space: spaces.Box
+        image, hand_bound = spaces.Box(0, 255, (frame_size, frame_size, 3), np.uint8), self._state.bound[: len(HAND_NAMES)]
+        self.observation_space: spaces.Box | spaces.Dict
         if obs_type == "pixels":
-            self.observation_space = spaces.Box(0, 255, (frame_size, frame_size, 3), np.uint8)
-        else:
+            self.observation_space = image
+        elif obs_type == "state":
             self.observation_space = spaces.Box(-self._state.bound, self._state.bound, dtype=np.float32)
+        else:
+            self.observation_space = spaces.Dict(hand=spaces.Box(-hand_bound, hand_bound, dtype=np.float32), image=image)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
         :param seed: seed of the objects' places; the same seed gives the same start for every task
         :param options: not used
@@ -112,9 +119,9 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             judge.reset_model()
         self._n_decisions = 0
         self._solved = False
-        return self._observation(), self._judge(np.zeros(4))[1]
+        return self.get_observation(), self._judge(np.zeros(4))[1]
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
         :param action: (4,) float, clipped to [-1, 1]
         :return: observation, stock reward of the chosen task, False, truncated, and info:
@@ -133,7 +140,7 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
         self.scene.advance(action, self.action_repeat, look if self.success == "any" else None)
         self._n_decisions += 1
         reward, info = self._judge(action, passed)
-        return self._observation(), reward, False, self._n_decisions >= self.episode_length, info
+        return self.get_observation(), reward, False, self._n_decisions >= self.episode_length, info
 
     def stock_observation(self, task: str) -> np.ndarray:
         """
@@ -199,7 +206,12 @@ class MultimodalMetaworldEnv(gym.Env[np.ndarray, np.ndarray]):
             self._renderer = SceneRenderer(self.scene, self.frame_size, self.camera)
         return self._renderer
 
-    def _observation(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray | dict[str, np.ndarray]:
+        """
+        :return: the observation of the scene as it is
+        """
+        if self.obs_type == "both":
+            return {"hand": self.get_state()[: len(HAND_NAMES)], "image": self.get_frame()}
         return self.get_frame() if self.obs_type == "pixels" else self.get_state()
 
     def get_state(self) -> np.ndarray:
