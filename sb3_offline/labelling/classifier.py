@@ -1,7 +1,6 @@
 """A classifier of success from examples: the probability that an observation of the data shows the solved task."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +23,6 @@ from sb3_offline.common.torch_layers import (
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import Observations
-from sb3_offline.data.spaces import subspace
 from sb3_offline.labelling.calibration import Calibration, calibrate
 from sb3_offline.labelling.losses import positive_unlabelled_loss
 
