@@ -262,7 +262,7 @@ def test_the_table_with_images_and_hand_is_learned_from_images_of_success(tmp_pa
     with pytest.raises(SystemExit):
         cli.main(["examples", "both.h5", "-o", "other.h5", "-n", "3", "--keys", "picture"])
     options = ["--dataset", "both.h5", "--examples", "images.h5", "--task", "drawer-open", "-n", "2", "--output", "run"]
-    cli.main(["train", "--config", "ceborl_both", *options, "--hyperparams", "batch_size:4", "policy_batches:2"])
+    cli.main(["train", "--config", "ceborl_both", *options, "--hyperparams", "batch_size:4"])
     model, config = load_run(tmp_path / "run" / "model.zip")
     assert model.example_keys == ["image"] and config["env_kwargs"] == {"obs_type": "both", "task": "drawer-open"}
     assert len(evaluate_success(model, config["env"], {**config["env_kwargs"], "episode_length": 2}, 1).successes) == 1

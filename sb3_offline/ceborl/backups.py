@@ -25,6 +25,9 @@ from sb3_offline.data.buffer import Horizon, OfflineReplayBuffer, OfflineSamples
 from sb3_offline.data.examples import Observations, examples_checksum
 from sb3_offline.labelling.classifier import ClassifierSettings, success_probabilities
 
+#: Passes over the data after which a classifier of states has seen enough of them
+DETECTOR_PASSES = 50
+
 
 class Learner(Protocol):
     """What backups ask of their model."""
@@ -231,10 +234,12 @@ class EpisodeBackup(Backup):
 
 
 def _detector(buffer: OfflineReplayBuffer, examples: Observations) -> ClassifierSettings:
-    """:return: how to train the classifier of states: less long from images, where a network takes minutes"""
+    """:return: how to train the classifier of states: less long from images, where a network takes minutes, and on few data"""
     n_examples = len(next(iter(examples.values())) if isinstance(examples, dict) else examples)
-    settings = ClassifierSettings(n_models=min(2, n_examples, len(buffer.lengths)))
-    return settings._replace(gradient_steps=300, batch_size=128) if has_images(buffer.observation_space) else settings
+    steps, batch_size = (300, 128) if has_images(buffer.observation_space) else (1000, 256)
+    steps = min(steps, 1 + DETECTOR_PASSES * buffer.size() // batch_size)
+    n_models = min(2, n_examples, len(buffer.lengths))
+    return ClassifierSettings(n_models=n_models, gradient_steps=steps, batch_size=batch_size)
 
 
 #: By the names that ``backup`` takes.
