@@ -24,7 +24,6 @@ from sb3_offline.labelling import (
     write_labelled_copy,
 )
 from sb3_offline.labelling.calibration import calibrate
-from sb3_offline.labelling.losses import positive_unlabelled_loss
 
 SETTINGS = ClassifierSettings(gradient_steps=150, batch_size=128)
 
@@ -86,19 +85,6 @@ def test_labels_repeat_and_leave_global_random_numbers_alone(buffer, probabiliti
 def test_too_few_examples_are_refused(buffer):
     with pytest.raises(DatasetError, match="examples: are 2, but the classifier needs 3"):
         success_probabilities(buffer, goal_examples(n=2), SETTINGS)
-
-
-def test_the_loss_corrects_for_successes_among_the_data():
-    rng = np.random.default_rng(0)
-    examples, data = rng.normal(size=20), rng.normal(size=30)
-
-    def loss(share):
-        return float(positive_unlabelled_loss(th.as_tensor(examples), th.as_tensor(data), share))
-
-    softplus = lambda x: np.log1p(np.exp(x)).mean()  # noqa: E731
-    assert loss(0) == pytest.approx(softplus(-examples) + softplus(data))
-    negatives = softplus(data) - 0.3 * softplus(examples)
-    assert loss(0.3) == pytest.approx(softplus(-examples) + abs(negatives) / 0.7)
 
 
 def test_probabilities_are_calibrated_without_labels():
