@@ -260,7 +260,9 @@ def _improved_policy(
         success,
         variant.temperature,
         variant.advantage_floor,
+        variant.advantage_floor,
         variant.weight_max,
+        exponent=0.0,
     )
     weighted = behavior * weights.view(N_STATES, N_ACTIONS)
     return weighted / weighted.sum(dim=1, keepdim=True)

@@ -3,13 +3,18 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from point_mass import ACTIONS, GOALS, RADIUS, STATES, goal_examples, write_point_mass
 
 from sb3_offline import CQL
+from sb3_offline.cli import main
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data.selection import select_episodes
+from sb3_offline.data.writer import DatasetWriter
+from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
+from sb3_offline.data_tools.inspecting.label_page import write_label_page
 from sb3_offline.experiment.training import create_model
 from sb3_offline.labelling import (
     ClassifierSettings,
@@ -24,7 +29,6 @@ from sb3_offline.labelling import (
     write_labelled_copy,
 )
 from sb3_offline.labelling.calibration import calibrate
-from sb3_offline.labelling.losses import positive_unlabelled_loss
 
 SETTINGS = ClassifierSettings(gradient_steps=150, batch_size=128)
 
@@ -86,19 +90,6 @@ def test_labels_repeat_and_leave_global_random_numbers_alone(buffer, probabiliti
 def test_too_few_examples_are_refused(buffer):
     with pytest.raises(DatasetError, match="examples: are 2, but the classifier needs 3"):
         success_probabilities(buffer, goal_examples(n=2), SETTINGS)
-
-
-def test_the_loss_corrects_for_successes_among_the_data():
-    rng = np.random.default_rng(0)
-    examples, data = rng.normal(size=20), rng.normal(size=30)
-
-    def loss(share):
-        return float(positive_unlabelled_loss(th.as_tensor(examples), th.as_tensor(data), share))
-
-    softplus = lambda x: np.log1p(np.exp(x)).mean()  # noqa: E731
-    assert loss(0) == pytest.approx(softplus(-examples) + softplus(data))
-    negatives = softplus(data) - 0.3 * softplus(examples)
-    assert loss(0.3) == pytest.approx(softplus(-examples) + abs(negatives) / 0.7)
 
 
 def test_probabilities_are_calibrated_without_labels():
@@ -225,3 +216,54 @@ def test_labels_are_rewards_of_their_own_data_alone(data, labels, tmp_path):
         other.learn(1)
     with pytest.raises(TypeError, match=r"label_episodes\(dataset, examples\)"):
         CQL("MlpPolicy", None, dataset=str(data), reward_fn="detected")
+
+
+def write_images(path, n_episodes=40, n_steps=8, keys=False):
+    """A light wanders over dark images; in a quarter of the episodes it ends in the lower right corner, which is success."""
+    rng = np.random.default_rng(0)
+    images = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    space = spaces.Dict({"image": images, "clock": spaces.Box(0, 1, (1,), np.float32)}) if keys else images
+    with DatasetWriter(path, space, ACTIONS, rewards=False) as writer:
+        for episode in range(n_episodes):
+            places = rng.integers(0, 18, size=(n_steps + 1, 2))
+            places[n_steps - 2 :] = 28 if episode % 4 == 0 else places[n_steps - 2 :]
+            frames = np.stack([light_at(*place) for place in places])
+            observations = {"image": frames, "clock": rng.random((n_steps + 1, 1), np.float32)} if keys else frames
+            success = (places > 20).all(axis=1)[1:]
+            writer.add_episode(observations, np.zeros((n_steps, 2), np.float32), success=success)
+    return np.arange(n_episodes) % 4 == 0
+
+
+def light_at(row, column):
+    image = np.full((36, 36, 3), 20, np.uint8)
+    image[row : row + 8, column : column + 8] = 230
+    return image
+
+
+@pytest.mark.parametrize("keys", [False, True], ids=["images", "dict"])
+def test_images_are_labelled_and_shown(keys, tmp_path, capsys):
+    solved = write_images(tmp_path / "lights.h5", keys=keys)
+    examples = {"image": np.stack([light_at(28, 28)] * 12)}
+    if keys:
+        examples["clock"] = np.random.default_rng(1).random((12, 1), np.float32)
+    np.savez(tmp_path / "examples.npz", **examples)
+    arguments = ["--examples", str(tmp_path / "examples.npz"), "--steps", "40", "--html", str(tmp_path / "page.html")]
+    arguments += ["-o", str(tmp_path / "labels.h5"), "--copy", str(tmp_path / "copy.h5"), "--check"]
+    main(["label", str(tmp_path / "lights.h5"), *arguments, "--device", "cpu"])
+    labels = load_labels(tmp_path / "labels.h5")
+    np.testing.assert_array_equal(labels.detected, solved)
+    np.testing.assert_array_equal(OfflineDataset(tmp_path / "copy.h5").success, OfflineDataset(tmp_path / "lights.h5").success)
+    said = capsys.readouterr().out
+    assert "10 of 40 episodes look like the examples." in said and "AUC 1.0000, precision 1.000, recall 1.000" in said
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('alt="frame"') == 10 + 24 + 10 and 'alt="example 0"' in page and "AUC, by the labels" in page
+    with pytest.raises(SystemExit, match=r"labels.h5: file: exists already\. Give --overwrite"):
+        main(["label", str(tmp_path / "lights.h5"), *arguments])
+    with pytest.raises(SystemExit, match="extras/x:2: is missing"):
+        main(["label", str(tmp_path / "lights.h5"), *arguments[:2], "--check", "extras/x:2"])
+
+
+def test_states_have_a_page_of_scores(data, labels, tmp_path):
+    write_label_page(tmp_path / "page.html", JoinedDatasets(data), labels, goal_examples())
+    page = (tmp_path / "page.html").read_text()
+    assert "There are no frames" in page and page.count("<tbody>") == 3 and f"<b>{labels.detected.sum()}</b>" in page

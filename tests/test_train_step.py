@@ -100,7 +100,8 @@ def test_in_sample_form(dataset, monkeypatch, advantage):
         seed=0,
         policy_kwargs=SMALL,
     )
-    model.class_prior, model._extraction.advantage_floor, model._extraction.weight_max = prior, floor, weight_max
+    model.class_prior, model._extraction.weight_max = prior, weight_max
+    model._extraction.advantage_floor, model._extraction.promise_floor = floor, 10 * floor
     reading = Reading(model, monkeypatch)
     batch, examples, target = reading.batch, reading.examples, model.critic_target
     one, many = (np.exp(reading.logits(target, h.observations, h.next_actions).min(axis=0)) for h in batch.horizons)
@@ -123,7 +124,8 @@ def test_in_sample_form(dataset, monkeypatch, advantage):
     odds = {"return": weight, "value": of_actions, "mean": np.sqrt(weight * of_actions)}[advantage]
     weights = ((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature)
     assert (weights > weight_max).any() and (weights < weight_max).any()
-    weights = np.minimum(weights, weight_max) * (np.exp(v) / (np.exp(v) + eps)) ** exponent
+    delta = 10 * eps
+    weights = np.minimum(weights, weight_max) * (odds / (odds + delta) * np.exp(v) / (np.exp(v) + delta)) ** exponent
     monkeypatch.setattr(model._extraction.pool, "draw", lambda n: batch.indices[:n].numpy())
     with th.no_grad():
         mean, log_std = (x.double().numpy() for x in model.actor.gaussian_parameters(model.actor.encode(batch.observations)))
@@ -167,7 +169,7 @@ def test_episode_form(dataset, monkeypatch):
     eps = 0.01 * GAMMA
     odds = np.sqrt(weight * np.exp(f.min(axis=0)))
     weights = np.minimum(((odds + eps) / (np.exp(v) + eps)) ** (1 / temperature), 100.0)
-    weights *= (np.exp(v) / (np.exp(v) + eps)) ** 2
+    weights *= (odds / (odds + 10 * eps) * np.exp(v) / (np.exp(v) + 10 * eps)) ** 2
     critic_loss, _ = reading.train()
     assert critic_loss == pytest.approx(beta * a + b + recursive(f, weight) + recursive(v, weight), rel=1e-4)
     np.testing.assert_allclose(model._extraction.pool.weights[batch.indices], weights, rtol=1e-3)

@@ -95,7 +95,7 @@ class CEBORL(RecursiveClassifier):
     :param advantage: the outcome that the weights compare with the state's odds: ``"return"``: omega, to which the dataset's
         actions led within the n-step window; ``"value"``: the classifier's odds of the dataset's action
     :param temperature: temperature of the advantage weights, which are the ratio of the odds to the power 1 / temperature
-    :param state_exponent: power by which states with odds below the floor count less. An advantage says which action is
+    :param state_exponent: power by which states and outcomes far from success count less. An advantage says which action is
         better in a state, but most states of a mixed dataset lead nowhere, and their best action matters little
     :param ent_coef: Entropy coefficient of ``policy_extraction="maximize"``
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps

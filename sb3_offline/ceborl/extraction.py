@@ -130,8 +130,10 @@ class WeightedRegression(PolicyExtraction):
     """
 
     needs_state_head = True
-    #: odds, as a share of the odds of success, below which advantages are noise and count little
+    #: odds, as a share of the odds of success, below which advantages are noise
     advantage_floor: float = 0.01
+    #: odds, as a share of the odds of success, below which states and outcomes count little
+    promise_floor: float = 0.1
     #: upper bound of the advantage weights
     weight_max: float = 100.0
     model: WeightingLearner
@@ -173,6 +175,7 @@ class WeightedRegression(PolicyExtraction):
             step.success,
             self.model.temperature,
             self.advantage_floor,
+            self.promise_floor,
             self.weight_max,
             self.model.state_exponent,
         )

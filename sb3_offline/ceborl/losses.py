@@ -141,28 +141,33 @@ def odds_ratio_weights(
     success: th.Tensor,
     temperature: float,
     advantage_floor: float,
+    promise_floor: float,
     weight_max: float,
-    state_exponent: float = 0.0,
+    exponent: float,
 ) -> th.Tensor:
     """
-    Advantage weights of the dataset's actions: the odds of the action over the odds of its state, times how promising the
-    state is: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (odds(s) / (odds(s) + eps)) ** state_exponent``.
+    Advantage weights of the dataset's actions: the odds of the action over the odds of its state, times how promising both
+    are: ``((odds(s, a) + eps) / (odds(s) + eps)) ** (1 / temperature) * (share(odds(s, a)) share(odds(s))) ** exponent``,
+    with ``share(x) = x / (x + delta)``.
 
-    The advantage is a ratio because odds grow by orders of magnitude along a successful trajectory. ``eps`` is a small share
-    of the odds of success. Where both odds are far below it, their ratio is noise: the first factor is about 1, and the second
-    is small. Where both are above it, the second factor is about 1, so the way to success counts as much as its end.
+    The advantage is a ratio because odds grow by orders of magnitude along a successful trajectory. ``eps`` and ``delta`` are
+    small shares of the odds of success. Where both odds are far below ``eps``, their ratio is noise: the first factor is about
+    1, and the second is small. Where both are above ``delta``, the second factor is about 1, so the way to success counts as
+    much as its end. Without the second factor, failures would have most of the weight where most episodes pass through,
+    such as their common start.
 
     :param odds: outcomes of the dataset's actions: learned odds, or the targets that they are learned from, ``(batch,)``
     :param state_logits: logits of the classifier that sees the state alone, ``(batch,)``
     :param success: the odds of success itself, which set the scale of the odds, scalar
     :param temperature: the smaller, the sharper the weights
     :param advantage_floor: eps as a share of the odds of success
+    :param promise_floor: delta as a share of the odds of success
     :param weight_max: upper bound of the first factor; the second is at most 1
-    :param state_exponent: how much less unpromising states count; 0: all states count alike
+    :param exponent: how much less unpromising states and outcomes count; 0: all count alike
     :return: ``(batch,)``
     """
     state_odds = success_odds(state_logits.unsqueeze(0), OVERFLOW)
-    eps = advantage_floor * success
+    eps, delta = advantage_floor * success, promise_floor * success
     log_ratio = th.log(odds + eps) - th.log(state_odds + eps)
     weights = (log_ratio / temperature).clamp(max=math.log(weight_max)).exp()
-    return weights * (state_odds / (state_odds + eps)) ** state_exponent
+    return weights * (odds / (odds + delta) * state_odds / (state_odds + delta)) ** exponent

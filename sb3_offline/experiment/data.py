@@ -85,7 +85,7 @@ def _selected(dataset: Any, episodes: Any, labels: Any, examples: Any) -> Any:
         remedy = "give `detected` alone, as true or a number of episodes"
         raise RuntimeError(f"The config's `episodes` is {episodes!r}; {remedy}: labels are made from all of the data")
     if "detected" in asked:
-        return select_detected(dataset, number, labels=labels, examples=examples)
+        return select_detected(dataset, asked["detected"], labels=labels, examples=examples)
     try:
         return select_episodes(dataset, **episodes)
     except TypeError as error:

@@ -10,6 +10,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_offline.common.augmentation import has_images, shift_observations
 from sb3_offline.common.choices import CountingFromZero
@@ -24,12 +25,13 @@ from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import Observations
 from sb3_offline.labelling.calibration import Calibration, calibrate
-from sb3_offline.labelling.losses import positive_unlabelled_loss
 
 #: Makes a new, untrained encoder of observations, e.g. ``policy.make_features_extractor``
 EncoderFactory = Callable[[], BaseFeaturesExtractor]
 
 SCORED_AT_ONCE = 512
+#: Every so many gradient steps, so many observations are scored, and so many of the highest are the hard ones from then on
+HARD_EVERY, HARD_SCORED, HARD_KEPT = 50, 4096, 512
 VECTOR_STEPS, IMAGE_STEPS = 300, 200
 
 
@@ -39,23 +41,25 @@ class ClassifierSettings(NamedTuple):
 
     :param n_models: networks, each trained without one share of the episodes and of the examples, which it then judges
     :param gradient_steps: gradient steps of each; ``None`` for 300 from vectors and 200 from images
-    :param batch_size: observations of the data in a batch, beside as many examples
+    :param batch_size: observations of the data in a batch
+    :param example_batch_size: examples in a batch; both classes weigh the same
+    :param hard_share: share of the observations in a batch that are drawn from those that look most like success so far,
+        which are successes and near misses; 0 draws all uniformly
     :param learning_rate: learning rate
     :param weight_decay: L2 penalty
     :param net_arch: hidden layers on top of the encoder
     :param max_shift: largest random shift of images in pixels
-    :param positive_share: share of the data's observations that look like the examples, where it is known; 0 takes all for
-        failures in the loss
     """
 
     n_models: int = 3
     gradient_steps: int | None = None
     batch_size: int = 256
+    example_batch_size: int = 64
+    hard_share: float = 0.5
     learning_rate: float = 3e-4
     weight_decay: float = 1e-2
     net_arch: tuple[int, ...] = (256, 256)
     max_shift: int = 4
-    positive_share: float = 0.0
 
 
 class StepProbabilities(NamedTuple):
@@ -143,11 +147,17 @@ def success_probabilities(
     seed: int = 0,
 ) -> StepProbabilities:
     """
-    Train classifiers on success examples against the data, and compute the probability of success of all observations.
+    Train classifiers to tell success examples from the data, and compute the probability of success of all observations.
 
-    No observation is judged by a network that was trained on its episode: each of ``n_models`` networks leaves out one share
-    of the episodes and of the examples, and judges these. What it says of the examples and data that it did not see also
-    calibrates the probabilities. Global random numbers stay as they are.
+    - Half of the observations that a network learns from are those that look most like success so far, so that it learns to
+      tell successes from near misses.
+    - No observation is judged by a network that was trained on its episode: each of ``n_models`` networks leaves out one share
+      of the episodes and of the examples, and judges these.
+    - What the networks say of what they did not see becomes a probability. The data are not taken for failures in this: they
+      are unlabelled, and the share of successes among them is estimated, see
+      :func:`~sb3_offline.labelling.calibration.calibrate`.
+
+    Global random numbers stay as they are.
 
     :param buffer: the data, on the device to compute on. Its observations are read as the files hold them
     :param examples: ``(n, *observation)`` in the buffer's space (images channel-first), or a dict of these; from
@@ -238,17 +248,29 @@ def _train(
     fit_statistics(model, buffer.observation_statistics)
     model.set_training_mode(True)
     optimizer = th.optim.Adam(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
+    hard, n_hard = rows, round(settings.hard_share * settings.batch_size)
     with th.enable_grad():
-        for _ in range(gradient_steps):
-            data = source.data(rng.choice(rows, settings.batch_size))
-            shown = source.examples(rng.choice(example_rows, settings.batch_size))
+        for step in range(gradient_steps):
+            if n_hard and step and step % HARD_EVERY == 0:
+                hard = _hard_rows(model, source, rng.choice(rows, min(HARD_SCORED, len(rows)), replace=False))
+            drawn = np.concatenate([rng.choice(hard, n_hard), rng.choice(rows, settings.batch_size - n_hard)])
+            data = source.data(drawn)
+            shown = source.examples(rng.choice(example_rows, settings.example_batch_size))
             data, shown = (shift_observations(batch, space, settings.max_shift, rng) for batch in (data, shown))
-            loss = positive_unlabelled_loss(model(shown), model(data), settings.positive_share)
+            loss = F.softplus(-model(shown)).mean() + F.softplus(model(data)).mean()  # cross-entropy, of both classes alike
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
     model.set_training_mode(False)
     return model
+
+
+def _hard_rows(model: StateClassifier, source: _Observations, rows: np.ndarray) -> np.ndarray:
+    """:return: those of these rows of the data that look most like success, an eighth"""
+    model.set_training_mode(False)
+    highest = np.argsort(-_logits(model, source.data, rows), kind="stable")[: len(rows) * HARD_KEPT // HARD_SCORED]
+    model.set_training_mode(True)
+    return rows[highest]
 
 
 def _default_encoder(space: spaces.Space) -> BaseFeaturesExtractor:
