@@ -13,6 +13,7 @@ COMMANDS = {
     "select-sac": "select checkpoints of train-sac for collect-sac, and measure them",
     "examples": "draw success examples from a labelled dataset",
     "inspect": "show the content of a dataset and likely mistakes in it",
+    "check": "check files and runs for damage",
     "render": "draw the frames of a dataset again, with another size or camera",
     "convert": "compress or uncompress a dataset, or convert it from and to other libraries",
     "train": "train one policy",

@@ -3,6 +3,7 @@
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from sb3_offline.data.spaces import check_observations, space_to_json, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
 EXAMPLES_VERSION = 1
+ARRAY_CRC = "crc"  # attribute of each array: its CRC-32
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Pillow's modes with 8 bits per channel. It would clip images of other modes (16-bit PNGs) to white
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
@@ -110,7 +112,7 @@ def _write(
         file.attrs["observation_space"] = space_to_json(observation_space)
         file.attrs["provenance"] = json.dumps(dict(provenance or {}))
         for name, array in arrays.items():
-            file.create_dataset(name, data=array)
+            file.create_dataset(name, data=array).attrs[ARRAY_CRC] = np.uint32(zlib.crc32(np.ascontiguousarray(array)))
 
 
 def _read_hdf5(path: Path) -> Observations:
@@ -142,7 +144,13 @@ def _read_array(array: Any, path: Path) -> np.ndarray:
     size = os.fstat(array.file.id.get_vfd_handle()).st_size
     row_bytes = int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
     check_stored(array, array.shape[0], row_bytes, size, path)
-    return array[()]
+    values = array[()]
+    stored = read_attribute(array, ARRAY_CRC)
+    if stored is not None and not (isinstance(stored, np.integer) and stored == zlib.crc32(np.ascontiguousarray(values))):
+        problem = "does not match the checksum that was written with it"
+        remedy = f"Copy the file again. If you changed the array yourself, delete its attribute {ARRAY_CRC}"
+        raise DatasetError(path, array.name.lstrip("/"), problem, remedy)
+    return values
 
 
 def _read_numpy(path: Path, space: spaces.Space) -> Observations:

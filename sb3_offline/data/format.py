@@ -8,6 +8,7 @@ observations than it has steps, so that no observation is stored twice.
 import json
 import operator
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,10 @@ CHUNK_BYTES = 50 * 64 * 64 * 3
 # Kinds of dtypes of extras: flags, numbers, and texts of a fixed length. Others, such as references, records and texts of
 # variable length, would point to other places in the file.
 EXTRA_KINDS = "biufS"
+
+# The checksums: an array with a row for each episode, and attributes that later writers and readers of version 1 may lack.
+CHECKSUMS = "episodes/crc"
+COLUMNS, ATTRIBUTES_CRC = "crc_fields", "crc_attributes"
 
 Storage = Literal["contiguous", "compressed"]
 
@@ -210,6 +215,31 @@ def _decode_texts(text: str) -> list[str]:
     return value
 
 
+def checksum_columns(fields: Mapping[str, Field]) -> list[str]:
+    """
+    :param fields: the arrays of a file
+    :return: their names, in the order of the columns of their checksums
+    """
+    return sorted(fields)
+
+
+def checksum_field(fields: Mapping[str, Field]) -> Field:
+    """
+    :param fields: the arrays of a file
+    :return: the array of their checksums
+    """
+    return Field("episode", (len(fields),), np.dtype(np.uint32))
+
+
+def attributes_crc(attributes: Mapping[str, Any]) -> int:
+    """
+    :param attributes: the attributes of a file, without their checksum
+    :return: their checksum (CRC-32)
+    """
+    lines = "".join(f"{name}={attributes[name]}\n" for name in sorted(attributes))
+    return zlib.crc32(lines.encode(errors="surrogatepass"))
+
+
 def create_file(
     path: Path, header: Header, n_episodes: int, n_steps: int, *, committed: int, storage: Storage = "contiguous"
 ) -> None:
@@ -229,9 +259,11 @@ def create_file(
         raise TypeError(f"storage is {storage!r}; choose 'contiguous' or 'compressed'")
     # Arrays begin at whole pages, so that reading a memory-mapped row touches as few pages as possible.
     with h5py.File(path, "w", locking=False, alignment_threshold=4096, alignment_interval=4096) as file:
-        for name, value in header.attributes().items():
+        fields = header.fields()
+        attributes = {**header.attributes(), COLUMNS: json.dumps(checksum_columns(fields))}
+        for name, value in {**attributes, ATTRIBUTES_CRC: np.uint32(attributes_crc(attributes))}.items():
             file.attrs[name] = value
-        for name, spec in header.fields().items():
+        for name, spec in {**fields, CHECKSUMS: checksum_field(fields)}.items():
             _create_array(file, name, (spec.rows(n_episodes, n_steps), *spec.shape), spec, storage)
         _create_array(file, "n_episodes", (), Field("episode", (), np.dtype(np.int64)), "contiguous")
         file["n_episodes"][()] = committed

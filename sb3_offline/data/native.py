@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 
 from sb3_offline.data.arrays import ArrayLike, HDF5Array, MappedArray, MappedFile
+from sb3_offline.data.checksums import Checksums, read_checksums
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.format import FORMAT, Header, Storage, read_header
 from sb3_offline.data.plain import check_plain, check_stored, is_text, read_attribute
@@ -23,11 +24,13 @@ class Native(NamedTuple):
     :param header: spaces, attributes, and which arrays there are
     :param arrays: by name, as ``Header.fields`` names them
     :param storage: how the file stores its arrays
+    :param checksums: the checksums of its episodes, which have not been compared with the arrays; ``None`` if it has none
     """
 
     header: Header
     arrays: dict[str, ArrayLike]
     storage: Storage
+    checksums: Checksums | None
 
 
 def is_native(file: h5py.File) -> bool:
@@ -90,7 +93,7 @@ def _read(file: h5py.File, path: Path) -> Native:
             arrays[name] = MappedArray(mapped, offset, rows, spec)
         else:
             arrays[name] = HDF5Array(path, name, rows, spec)
-    return Native(header, arrays, storage)
+    return Native(header, arrays, storage, read_checksums(file, path, fields, n_episodes, found["episodes/length"], size))
 
 
 def _check_integers(array: h5py.Dataset, ndim: int, path: Path, name: str) -> None:

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.data import given_data
 
 MODEL_FILE, CONFIG_FILE = "model.zip", "config.yml"
 # Record of a run that is to replace a finished one, whose files stay until the new model is whole.
 PENDING_FILE = "config.pending.yml"
+# Everything that a killed run needs to continue.
+RESUME_FILE = "resume.zip"
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,25 @@ def recorded_run(output: Path) -> dict[str, Any] | None:
     if not config_file.is_file():
         return None
     try:
-        record = yaml.safe_load(config_file.read_text(encoding="utf-8"))
+        return read_record(config_file)
+    except DatasetError as error:
+        warnings.warn(f"{config_file}: {error.problem}, so the run starts from the beginning.")
+        return None
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """
+    :param file: the ``config.yml`` of a run
+    :return: its content
+    :raises DatasetError: if it is damaged
+    """
+    try:
+        record = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         record = " ".join(str(error).split())
-    if not isinstance(record, dict):
-        warnings.warn(f"{config_file}: is damaged ({str(record)[:200]}), so the run starts from the beginning.")
-        return None
+    if not isinstance(record, dict) or not {"algo", "env", "env_kwargs"} <= record.keys():
+        problem = f"is damaged ({str(record)[:200]})"
+        raise DatasetError(file, "file", problem, "Restore it from a copy, or train again")
     return record
 
 
