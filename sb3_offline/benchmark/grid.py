@@ -68,6 +68,10 @@ class Grid:
     episodes: int = 10
 
     def __post_init__(self) -> None:
+        for kind, names in {"methods": self.methods, "tasks": self.tasks}.items():
+            for name in names:
+                if not name.strip(". ") or not name.isprintable() or set(name) & set('/\\:*?"<>|'):
+                    raise RuntimeError(f"{kind}: {name!r} names files, so it must be a word without slashes; rename it")
         if self.n_timesteps % (2 * self.checkpoints) or self.n_timesteps <= 0:
             raise RuntimeError(
                 f"n_timesteps is {self.n_timesteps}, but {self.checkpoints} checkpoints evenly spaced over the last half "

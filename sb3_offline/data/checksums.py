@@ -50,7 +50,7 @@ class RunningChecksums:
 
     def update(self, rows: np.ndarray) -> None:
         """:param rows: the next rows of the array, as they are stored"""
-        raw = memoryview(_bytes(rows))
+        raw = _bytes(rows)
         row_bytes = len(raw) // max(len(rows), 1)
         start, last = self._row, self._row + len(rows)
         while self._row < last:
@@ -221,5 +221,5 @@ def _names(columns: Any) -> set[str]:
         return set()
 
 
-def _bytes(rows: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8)
+def _bytes(rows: np.ndarray) -> memoryview:
+    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data

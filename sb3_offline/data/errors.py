@@ -3,6 +3,14 @@
 import os
 
 
+def printable(text: str) -> str:
+    """
+    :param text: a text with words of a file
+    :return: the text for a terminal, which control characters could steer; ends of lines stay
+    """
+    return "".join(letter if letter.isprintable() or letter == "\n" else f"\\x{ord(letter):02x}" for letter in text)
+
+
 class DatasetError(RuntimeError):
     """
     Data in a file, or data that are to be written to a file, cannot be used.
@@ -22,6 +30,4 @@ class DatasetError(RuntimeError):
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.file else self.field
-        text = " ".join(f"{place}: {self.problem}. {self.remedy}.".splitlines())
-        # The words of a file reach the terminal here: control characters in them must not
-        return "".join(character if character.isprintable() else f"\\x{ord(character):02x}" for character in text)
+        return printable(" ".join(f"{place}: {self.problem}. {self.remedy}.".splitlines()))

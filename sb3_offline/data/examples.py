@@ -112,7 +112,7 @@ def _write(
         file.attrs["observation_space"] = space_to_json(observation_space)
         file.attrs["provenance"] = json.dumps(dict(provenance or {}))
         for name, array in arrays.items():
-            file.create_dataset(name, data=array).attrs[ARRAY_CRC] = np.uint32(zlib.crc32(np.ascontiguousarray(array)))
+            file.create_dataset(name, data=array).attrs[ARRAY_CRC] = np.uint32(zlib.crc32(np.ascontiguousarray(array).data))
 
 
 def _read_hdf5(path: Path) -> Observations:
@@ -146,7 +146,7 @@ def _read_array(array: Any, path: Path) -> np.ndarray:
     check_stored(array, array.shape[0], row_bytes, size, path)
     values = array[()]
     stored = read_attribute(array, ARRAY_CRC)
-    if stored is not None and not (isinstance(stored, np.integer) and stored == zlib.crc32(np.ascontiguousarray(values))):
+    if stored is not None and not (isinstance(stored, np.integer) and stored == zlib.crc32(np.ascontiguousarray(values).data)):
         problem = "does not match the checksum that was written with it"
         remedy = f"Copy the file again. If you changed the array yourself, delete its attribute {ARRAY_CRC}"
         raise DatasetError(path, array.name.lstrip("/"), problem, remedy)

@@ -1,8 +1,10 @@
 """The description of one training run, and its record on the disk."""
 
+import contextlib
 import json
 import warnings
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import yaml
 
 from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import WriteLock
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.data import given_data
 
@@ -19,6 +22,37 @@ MODEL_FILE, CONFIG_FILE = "model.zip", "config.yml"
 PENDING_FILE = "config.pending.yml"
 # Everything that a killed run needs to continue.
 RESUME_FILE = "resume.zip"
+
+
+class RunInUseError(DatasetError):
+    """Another process trains in the folder of the run."""
+
+
+@contextlib.contextmanager
+def locked_run(folder: Path) -> Iterator[None]:
+    """
+    Lock the folder of a run, since two runs would mix their files. A folder in which nothing is written is removed again.
+
+    :param folder: the folder, which is created
+    :raises RunInUseError: if another process trains in it
+    :raises DatasetError: if it cannot be written to
+    """
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        lock = WriteLock(folder / "run")
+    except DatasetError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise
+        problem = error.problem.replace("being written by", "in use by")
+        remedy = "Wait until that run has ended, or name another folder"
+        raise RunInUseError(folder, "folder", problem, remedy) from error
+    try:
+        yield
+    finally:
+        lock.release()
+        with contextlib.suppress(OSError):  # not empty
+            for place in created:
+                place.rmdir()
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sb3_offline.envs import lacks_task
 from sb3_offline.experiment.data import data_arguments
 from sb3_offline.experiment.evaluation import make_evaluation_env
 from sb3_offline.experiment.evaluation_table import EvaluationTable
-from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, RESUME_FILE, TrainingRun, read_record
+from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, RESUME_FILE, TrainingRun, locked_run, read_record
 
 # Beginning of the names of an earlier run's tables, while a new run replaces it.
 EARLIER = "earlier_"
@@ -213,7 +213,13 @@ def train_run(
         with the run
     :param verbose: 1 for info messages
     :return: the trained model
+    :raises RunInUseError: if another process trains in the folder
     """
+    with locked_run(run.output):
+        return _train_run(run, progress_bar, callbacks, verbose)
+
+
+def _train_run(run: TrainingRun, progress_bar: bool, callbacks: Sequence[BaseCallback], verbose: int) -> OfflineAlgorithm:
     record = run.record()
     config = {**run.config, "env_kwargs": record["env_kwargs"]}
     _check_counts({"n_timesteps": config["n_timesteps"], "n_eval_episodes": run.n_eval_episodes})
