@@ -40,7 +40,8 @@ from sb3_offline.experiment.training import load_run, train_run
 
 FIELDS = ("trouble", "rounds", "lost", "damaged", "remark")
 STATES, ACTIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (2,), np.float32)
-FORK = multiprocessing.get_context("fork")  # everything is imported once
+# Everything is imported once. Shared values have no lock, since a killed process would keep it
+FORK = multiprocessing.get_context("fork")
 
 
 def episode(index: int) -> dict[str, Any]:
@@ -104,7 +105,7 @@ def write_on(path: Path, counter: Any, n: int | None = None) -> None:
 
 def kills_of_the_writer(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
     """A process that appends episodes is killed at a random moment, and the next one goes on with its file."""
-    path, counter = folder / "d.h5", FORK.Value("q", 0)
+    path, counter = folder / "d.h5", FORK.RawValue("q", 0)
     lost = damaged = n_while_writing = 0
     for number in range(rounds):
         if number % 20 == 0:
@@ -154,16 +155,16 @@ def read_it(path: Path, wrong: Any, until: float) -> None:
 def meetings(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
     """A writer, a second writer, a converter in place and a reader meet at one file."""
     lost = damaged = disturbed = 0
-    counter, wrong = FORK.Value("q", 0), FORK.Value("q", 0)
+    counter, wrong = FORK.RawValue("q", 0), FORK.RawValue("q", 0)
     for number in range(rounds):
         path = folder / f"m{number}.h5"
         counter.value = 0
-        until = time.monotonic() + 0.15
-        first = in_child(write_on, path, counter, 8)
+        until = time.monotonic() + 0.04
+        first = in_child(write_on, path, counter, 6)
         others = [in_child(ask, path, until), in_child(convert_it, path, until), in_child(read_it, path, wrong, until)]
         for process in (first, *others):
             process.join()
-        disturbed += first.exitcode != 0 or counter.value != 8
+        disturbed += first.exitcode != 0 or counter.value != 6
         new = losses(path, counter.value)
         lost, damaged = lost + new[0], damaged + new[1]
         path.unlink(missing_ok=True)
@@ -238,7 +239,7 @@ def kills_of_training(folder: Path, kills: int, rng: random.Random) -> tuple[int
 def full_disks(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
     """The disk fills up while episodes are written; then there is room again, and the writer goes on."""
     place, lost, damaged, n_full = folder / "small", 0, 0, 0
-    counter = FORK.Value("q", 0)
+    counter = FORK.RawValue("q", 0)
     for _ in range(rounds):
         place.mkdir()
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={rng.randint(100, 400)}k", "none", place], check=True)

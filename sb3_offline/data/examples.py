@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.files import WriteLock, open_hdf5, replacing
 from sb3_offline.data.plain import check_all_plain, check_stored, is_text, read_attribute
 from sb3_offline.data.spaces import check_observations, space_to_json, to_array
@@ -130,11 +130,10 @@ def _read_hdf5(path: Path) -> Observations:
             if isinstance(node, h5py.Dataset):
                 return _read_array(node, path)
             return {key: _read_array(array, path) for key, array in node.items()}
-        except (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
-            if isinstance(error, DatasetError):
-                raise
-            problem = f"cannot be read ({' '.join(str(error).split())})"
-            raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+        except DatasetError:
+            raise
+        except DAMAGE_ERRORS as error:
+            raise damaged_file(path, error) from error
 
 
 def _read_array(array: Any, path: Path) -> np.ndarray:

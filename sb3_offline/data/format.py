@@ -108,8 +108,8 @@ class Header:
             fields["rewards"] = Field("step", (), np.dtype(np.float32))
         for name in ("terminated", "truncated") + (("success",) if self.success else ()):
             fields[name] = Field("step", (), np.dtype(bool))
-        for name, (shape, dtype) in self.extras.items():
-            fields[f"extras/{name}"] = _extra_field(name, shape, dtype)
+        for name, declared in self.extras.items():
+            fields[f"extras/{name}"] = _extra_field(name, declared)
         return fields
 
     def attributes(self) -> dict[str, Any]:
@@ -126,15 +126,16 @@ class Header:
         return attributes if self.sources is None else {**attributes, "sources": json.dumps(self.sources)}
 
 
-def _extra_field(name: str, shape: Any, dtype: Any) -> Field:
+def _extra_field(name: str, declared: Any) -> Field:
     """:return: the field of an extra; raises ``DatasetError`` if a file cannot hold it as a plain array"""
     field = f"extras/{name}"
     if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or "\0" in name:
         raise DatasetError("", field, "is no name of an array", "Give a name without a slash")
     try:
+        shape, dtype = declared
         spec = Field("step", tuple(operator.index(size) for size in shape), np.dtype(dtype))
-    except TypeError as error:
-        raise DatasetError("", field, f"is declared as {(shape, dtype)!r}", "Give (shape of one row, dtype)") from error
+    except (TypeError, ValueError) as error:
+        raise DatasetError("", field, f"is declared as {declared!r:.100}", "Give (shape of one row, dtype)") from error
     if spec.dtype.kind not in EXTRA_KINDS or spec.dtype.itemsize == 0 or min(spec.shape, default=0) < 0:
         problem = f"has rows of shape {spec.shape} and dtype {spec.dtype}"
         raise DatasetError("", field, problem, "Use numbers, flags, or texts of a fixed length ('S10')")

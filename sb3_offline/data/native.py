@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_offline.data.arrays import ArrayLike, HDF5Array, MappedArray, MappedFile
 from sb3_offline.data.checksums import Checksums, read_checksums
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.format import FORMAT, Header, Storage, read_header
 from sb3_offline.data.plain import check_plain, check_stored, is_text, read_attribute
 
@@ -54,9 +54,8 @@ def read_native(file: h5py.File, path: Path) -> Native:
         return _read(file, path)
     except DatasetError:
         raise
-    except (OSError, RuntimeError, KeyError, IndexError, TypeError, ValueError, OverflowError, MemoryError) as error:
-        problem = f"cannot be read ({' '.join(str(error).split())})"
-        raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+    except DAMAGE_ERRORS as error:
+        raise damaged_file(path, error) from error
 
 
 def _read(file: h5py.File, path: Path) -> Native:

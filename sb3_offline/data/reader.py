@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_offline.data.arrays import ArrayLike, MappedArray
 from sb3_offline.data.checks import check_values
 from sb3_offline.data.checksums import Checksums, verify
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.foreign.base import Options
 from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.foreign.registry import find_path, read_foreign, recognize, unknown_format
@@ -80,7 +80,12 @@ class OfflineDataset:
         self._given = find_path(path) if isinstance(path, str | os.PathLike) else path
         with Probe(self._given) as probe:
             self.path = probe.path
-            self.header, arrays = self._read(probe, Options(observation_space, action_space, max_episode_steps))
+            try:
+                self.header, arrays = self._read(probe, Options(observation_space, action_space, max_episode_steps))
+            except DAMAGE_ERRORS as error:
+                if probe.is_object or isinstance(error, DatasetError):
+                    raise
+                raise damaged_file(self.path, error) from error
         if episodes is not None:
             indices = self._options["episodes"] = _episode_indices(episodes, len(arrays["episodes/length"]), self.path)
             arrays, self.storage = _selected(arrays, indices), "memory"
@@ -174,7 +179,13 @@ def _as_plain(array: ArrayLike) -> Any:
 
 def _episode_indices(episodes: Sequence[int] | np.ndarray, n_episodes: int, path: Path) -> np.ndarray:
     """:return: int64 indices, of a list of indices or a mask"""
-    given = np.asarray(episodes)
+    try:
+        given = np.asarray(episodes)
+    except ValueError:
+        given = np.empty(())
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iub"):
+        problem = f"is {episodes!r:.100}"
+        raise DatasetError(path, "episodes", problem, "Give a list of whole numbers, or one flag for each episode")
     if given.dtype == bool and len(given) != n_episodes:
         problem = f"is a mask of {len(given)} flags, but there are {n_episodes} episodes"
         raise DatasetError(path, "episodes", problem, "Give one flag for each episode")

@@ -75,6 +75,13 @@ class DatasetWriter:
         self._lock: WriteLock | None = None  # held until the writer is closed, also while the file is replaced
         self._adopted_checksums: np.ndarray | None = None  # of the episodes of a file that has no checksums
         self._replaces = False  # whether the file is still to be created, or is an old one that is still to be replaced
+        for name, value in (("env_kwargs", env_kwargs), ("provenance", provenance), ("extras", extras)):
+            if value is not None and not isinstance(value, Mapping):
+                raise DatasetError(self.path, name, f"is {value!r:.100}", "Give a dict")
+        if not isinstance(env_id, str):
+            raise DatasetError(self.path, "env_id", f"is {env_id!r:.100}", "Give the id as a text, or none")
+        if sources is not None and (isinstance(sources, str) or not all(isinstance(s, str) for s in _listed(sources))):
+            raise DatasetError(self.path, "sources", f"is {sources!r:.100}", "Give a list of texts")
         self._header = Header(
             observation_space,
             action_space,
@@ -98,7 +105,11 @@ class DatasetWriter:
             raise
 
     def _open(self, mode: str, capacity: tuple[int, int]) -> None:
-        self._header.attributes()  # raises early if an attribute cannot be stored
+        try:
+            self._header.attributes()  # raises early if an attribute cannot be stored
+        except (TypeError, ValueError) as error:
+            problem = f"cannot be stored as JSON ({error})"
+            raise DatasetError(self.path, "env_kwargs, provenance", problem, "Give numbers, texts, lists and dicts") from error
         self._lock = WriteLock(self.path)
         remove_leftovers(self.path)
         exists = self.path.exists()
@@ -155,6 +166,8 @@ class DatasetWriter:
             truncated = np.zeros(n, dtype=bool)
             truncated[-1] = not terminated[-1]
         steps = {"actions": actions, "rewards": rewards, "terminated": terminated, "truncated": truncated, "success": success}
+        if extras is not None and not isinstance(extras, Mapping):
+            raise DatasetError(self.path, "extras", f"is {extras!r:.100}", "Give a dict of arrays")
         steps |= {f"extras/{name}": value for name, value in (extras or {}).items()}
         rows = check_observations(observations, self._header.observation_space, n + 1, self.path)
         rows |= self._check_steps({name: value for name, value in steps.items() if value is not None}, n)
@@ -309,6 +322,11 @@ class DatasetWriter:
         self._attach()
         with open_hdf5(self.path) as file:
             self._read_places(file)
+
+
+def _listed(values: Any) -> list[Any]:
+    """:return: the values; of something that is no list, a list without texts"""
+    return list(values) if isinstance(values, Sequence | np.ndarray) and np.ndim(values) == 1 else [None]
 
 
 def _copy(origin: Any, origin_offset: int, target: Any, target_offset: int, size: int) -> None:
