@@ -3,8 +3,8 @@ Inputs that are drawn at random, each with the outcome of opening it. ``test_fuz
 
     python tests/fuzz.py FOLDER KIND:FIRST:LAST ...
 
-Each line of the output is "KIND:NUMBER right", "KIND:NUMBER refused: ..." or "KIND:NUMBER WRONG: ...", cut off where the process
-died. An input is drawn from the seed, its kind and its number alone.
+Each line of the output is "KIND:NUMBER right", "KIND:NUMBER refused: ..." or "KIND:NUMBER WRONG: ...". It is cut off where the
+process died. An input is drawn from the seed, its kind and its number alone.
 """
 
 import contextlib

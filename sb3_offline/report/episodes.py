@@ -74,6 +74,9 @@ def play_finals(results: Results, runs: Path, *, trust: bool = False) -> Iterato
         model_file = cell_folder(runs, method, task, seed) / "model.zip"
         if model_file.is_file():
             model, config = load_run(model_file, trust=trust)
+            if ":" in str(config["env"]) and not trust:
+                remedy = "if you trust the origin of the runs, add --trust"
+                raise RuntimeError(f"{model_file}: its environment {config['env']!r} runs a module; {remedy}")
             env_kwargs = {**config["env_kwargs"], "task": task}
             yield method, task, play(model, config["env"], env_kwargs, evaluation_seed(seed, len(entry.by("step")) - 1))
 
