@@ -1,7 +1,7 @@
 """
 Kill, fill and collide everything that writes, and count what is lost.
 
-    python benchmarks/chaos.py -o results/chaos.csv [--folder /dev/shm] [--kills 1000] [--meetings 1000] [--trainings 40]
+    python benchmarks/chaos.py -o results/chaos.csv [--folder /dev/shm] [--jobs 4] [--kills 1000] [--meetings 1000]
 
 Each row of the table is one kind of trouble. A lost episode is one for which `add_episode` had returned and which is not
 there afterwards; a damaged file is one that does not open, or whose episodes do not match their checksums. Processes are
@@ -20,9 +20,9 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
@@ -42,6 +42,31 @@ FIELDS = ("trouble", "rounds", "lost", "damaged", "remark")
 STATES, ACTIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (2,), np.float32)
 # Everything is imported once. Shared values have no lock, since a killed process would keep it
 FORK = multiprocessing.get_context("fork")
+
+
+class Rounds:
+    """
+    Counts rounds until there are enough of them, or until the time is over.
+
+    :param wanted: number of rounds
+    :param until: time of ``time.monotonic``
+    """
+
+    def __init__(self, wanted: int, until: float):
+        self.wanted, self.until, self.done = wanted, until, 0
+
+    def left(self) -> bool:
+        """:return: whether there is another round"""
+        return self.done < self.wanted and time.monotonic() < self.until
+
+    def __iter__(self) -> Iterator[int]:
+        while self.left():
+            self.done += 1
+            yield self.done - 1
+
+
+#: Numbers of lost episodes and of damaged files, and other counts
+Outcome: TypeAlias = tuple[int, int, dict[str, int]]
 
 
 def episode(index: int) -> dict[str, Any]:
@@ -103,11 +128,11 @@ def write_on(path: Path, counter: Any, n: int | None = None) -> None:
             counter.value = opened.n_episodes
 
 
-def kills_of_the_writer(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
+def kills_of_the_writer(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
     """A process that appends episodes is killed at a random moment, and the next one goes on with its file."""
     path, counter = folder / "d.h5", FORK.RawValue("q", 0)
     lost = damaged = n_while_writing = 0
-    for number in range(rounds):
+    for number in rounds:
         if number % 20 == 0:
             path.unlink(missing_ok=True)
             counter.value = 0
@@ -121,57 +146,65 @@ def kills_of_the_writer(folder: Path, rounds: int, rng: random.Random) -> tuple[
         n_while_writing += counter.value > before
         new = losses(path, counter.value)
         lost, damaged = lost + new[0], damaged + new[1]
-    return lost, damaged, f"{n_while_writing} of the kills came after the first episode of their process"
+    return lost, damaged, {"kills after the first episode of a process": n_while_writing}
 
 
-def ask(path: Path, until: float) -> None:
+def ask(place: Callable[[], Path], stop: Any) -> None:
     """Ask for the right to write, again and again."""
-    while time.monotonic() < until:
+    while not stop.value:
         try:
-            writer(path).close()
+            writer(place()).close()
         except DatasetError:
             pass
 
 
-def convert_it(path: Path, until: float) -> None:
+def convert_it(place: Callable[[], Path], stop: Any) -> None:
     """Convert a file in its place, again and again."""
-    while time.monotonic() < until:
+    while not stop.value:
         try:
-            convert(path, path, overwrite=True, progress_bar=False)
+            convert(place(), place(), overwrite=True, progress_bar=False)
         except DatasetError:
             pass
 
 
-def read_it(path: Path, wrong: Any, until: float) -> None:
-    """Read a file that is being written. Only a file that is not there yet may be refused, or one that was replaced."""
-    while time.monotonic() < until:
+def read_it(place: Callable[[], Path], stop: Any, wrong: Any) -> None:
+    """Read a file that is being written. Only a file that is not there may be refused, or one that was replaced."""
+    while not stop.value:
         try:
-            seeds = OfflineDataset(path).seeds
+            seeds = OfflineDataset(place()).seeds
             wrong.value += not np.array_equal(seeds, np.arange(len(seeds)))
         except DatasetError as error:
             wrong.value += "does not exist" not in str(error) and "was replaced" not in str(error)
 
 
-def meetings(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
-    """A writer, a second writer, a converter in place and a reader meet at one file."""
+def meetings(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
+    """A writer, a second writer, a converter in place and a reader meet at one file in each round."""
+    current, counter, wrong, stop = (FORK.RawValue("q", 0) for _ in range(4))
+
+    def place() -> Path:
+        return folder / f"m{current.value}.h5"
+
+    others = [in_child(ask, place, stop), in_child(convert_it, place, stop), in_child(read_it, place, stop, wrong)]
     lost = damaged = disturbed = 0
-    counter, wrong = FORK.RawValue("q", 0), FORK.RawValue("q", 0)
-    for number in range(rounds):
-        path = folder / f"m{number}.h5"
-        counter.value = 0
-        until = time.monotonic() + 0.04
-        first = in_child(write_on, path, counter, 6)
-        others = [in_child(ask, path, until), in_child(convert_it, path, until), in_child(read_it, path, wrong, until)]
-        for process in (first, *others):
-            process.join()
-        disturbed += first.exitcode != 0 or counter.value != 6
+    for number in rounds:
+        current.value, counter.value = number, 0
+        path = place()
+        try:
+            write_on(path, counter, 4)
+        except (DatasetError, OSError, RuntimeError) as error:
+            print(f"DISTURBED: {error}", flush=True)
+            disturbed += 1
         new = losses(path, counter.value)
         lost, damaged = lost + new[0], damaged + new[1]
         path.unlink(missing_ok=True)
-    return lost, damaged + wrong.value, f"{disturbed} writers were disturbed"
+    stop.value = 1
+    for process in others:
+        process.join()
+    died = sum(process.exitcode != 0 for process in others)
+    return lost, damaged + wrong.value, {"writers that were disturbed": disturbed, "others that failed": died}
 
 
-def two_converts(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
+def two_converts(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
     """Two conversions write one file at the same time; one of them is killed in half of the rounds."""
     source, target = folder / "s.h5", folder / "t.h5"
     with writer(source, "w", 100) as opened:
@@ -183,7 +216,7 @@ def two_converts(folder: Path, rounds: int, rng: random.Random) -> tuple[int, in
 
     lost = damaged = 0
     convert(source, target, progress_bar=False)
-    for number in range(rounds):
+    for number in rounds:
         processes = [in_child(work), in_child(work)]
         if number % 2:
             time.sleep(rng.uniform(0, 0.03))
@@ -192,10 +225,10 @@ def two_converts(folder: Path, rounds: int, rng: random.Random) -> tuple[int, in
             process.join()
         new = losses(target, 60)
         lost, damaged = lost + new[0], damaged + new[1]
-    return lost, damaged, "the old file or the new one was there, whole, after each round"
+    return lost, damaged, {}
 
 
-def kills_of_training(folder: Path, kills: int, rng: random.Random) -> tuple[int, int, str]:
+def kills_of_training(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
     """A training run is killed at random moments and goes on until it ends. Its model is compared with that of a whole run."""
     data = folder / "train.h5"
     with writer(data, "w", 100) as opened:
@@ -216,8 +249,8 @@ def kills_of_training(folder: Path, kills: int, rng: random.Random) -> tuple[int
     began = time.monotonic()
     process.join()
     duration = time.monotonic() - began
-    n_kills = n_runs = n_different = 0
-    while n_kills < kills:
+    n_runs = n_different = 0
+    while rounds.left():
         name, n_runs = f"run{n_runs}", n_runs + 1
         for number in range(1000):
             process = in_child(work, name)
@@ -226,21 +259,18 @@ def kills_of_training(folder: Path, kills: int, rng: random.Random) -> tuple[int
                 break
             process.kill()
             process.join()
-            n_kills += 1
+            rounds.done += 1
         same = [np.array_equal(*pair) for pair in zip(parameters("whole"), parameters(name), strict=True)]
         n_different += not all(same)
         shutil.rmtree(folder / name)
-    remark = (
-        f"{n_runs} runs were killed {n_kills} times; {n_runs - n_different} end with the bits of a run that was not killed"
-    )
-    return n_different, 0, remark
+    return n_different, 0, {"runs that went on to their end": n_runs, "of these with other bits": n_different}
 
 
-def full_disks(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
+def full_disks(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
     """The disk fills up while episodes are written; then there is room again, and the writer goes on."""
     place, lost, damaged, n_full = folder / "small", 0, 0, 0
     counter = FORK.RawValue("q", 0)
-    for _ in range(rounds):
+    for _ in rounds:
         place.mkdir()
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={rng.randint(100, 400)}k", "none", place], check=True)
         try:
@@ -257,10 +287,10 @@ def full_disks(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int,
         finally:
             subprocess.run(["umount", place], check=True)
             place.rmdir()
-    return lost, damaged, f"the disk was full in {n_full} rounds"
+    return lost, damaged, {"writers that met the full disk": n_full}
 
 
-def read_only_folders(folder: Path, rounds: int, rng: random.Random) -> tuple[int, int, str]:
+def read_only_folders(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:
     """Everything that writes is asked to write to a folder that cannot be written to."""
     place, damaged, n_refused = folder / "fixed", 0, 0
     place.mkdir()
@@ -279,7 +309,7 @@ def read_only_folders(folder: Path, rounds: int, rng: random.Random) -> tuple[in
             lambda: replacing(place / "text").__enter__(),
             lambda: locked_run(place / "run").__enter__(),
         ]
-        for number in range(rounds):
+        for number in rounds:
             try:
                 attempts[number % len(attempts)]()
                 damaged += 1
@@ -288,7 +318,31 @@ def read_only_folders(folder: Path, rounds: int, rng: random.Random) -> tuple[in
             damaged += sum(losses(path, 5)) + (os.listdir(place) != ["d.h5"])
     finally:
         subprocess.run(["umount", place], check=True)
-    return 0, damaged, f"{n_refused} attempts were refused in one line"
+    return 0, damaged, {"attempts refused in one line": n_refused}
+
+
+def in_jobs(
+    work: Callable[..., Outcome], wanted: int, jobs: int, args: argparse.Namespace
+) -> tuple[int, int, int, dict[str, int]]:
+    """:return: the sums over several processes, in a folder of its own each: rounds, lost, damaged, and other counts"""
+    until = time.monotonic() + 60 * args.minutes
+    receivers = []
+    for job in range(jobs):
+        receiver, sender = FORK.Pipe(duplex=False)
+        rounds = Rounds(wanted // jobs + (job < wanted % jobs), until)
+        FORK.Process(target=_job, args=(work, rounds, args.folder, args.seed + job, sender)).start()
+        sender.close()
+        receivers.append(receiver)
+    parts = [receiver.recv() for receiver in receivers]
+    done, lost, damaged = (sum(part[index] for part in parts) for index in range(3))
+    return done, lost, damaged, {name: sum(part[3][name] for part in parts) for name in parts[0][3]}
+
+
+def _job(work: Callable[..., Outcome], rounds: Rounds, folder: Path | None, seed: int, sender: Any) -> None:
+    th.set_num_threads(1)
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        lost, damaged, counts = work(Path(own), rounds, random.Random(seed))
+    sender.send((rounds.done, lost, damaged, counts))
 
 
 def main() -> None:
@@ -297,6 +351,8 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, help="CSV file to write")
     parser.add_argument("--folder", type=Path, help="folder to work in (default: that for temporary files)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2, help="number of processes that share the rounds (default: 2)")
+    parser.add_argument("--minutes", type=float, default=60, help="end each kind of trouble after this time (default: 60)")
     for name, rounds in (
         ("kills", 1000),
         ("meetings", 1000),
@@ -308,7 +364,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=rounds, help=f"number of rounds (default: {rounds})")
     args = parser.parse_args()
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    troubles: list[tuple[str, Callable[..., tuple[int, int, str]], int, bool]] = [
+    troubles: list[tuple[str, Callable[..., Outcome], int, bool]] = [
         ("a process that writes a dataset is killed", kills_of_the_writer, args.kills, False),
         ("two writers, a converter and a reader meet at one file", meetings, args.meetings, False),
         ("two conversions write one file, one of them killed", two_converts, args.converts, False),
@@ -324,13 +380,11 @@ def main() -> None:
         if not rounds:
             continue
         began = time.monotonic()
-        with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-            lost, damaged, remark = work(Path(folder), rounds, random.Random(args.seed))
-        rows.append(dict(zip(FIELDS, (trouble, rounds, lost, damaged, remark), strict=True)))
-        print(
-            f"{trouble}: {rounds} rounds, {lost} lost, {damaged} damaged; {remark} ({time.monotonic() - began:.0f} s)",
-            flush=True,
-        )
+        done, lost, damaged, counts = in_jobs(work, rounds, 1 if mounts else args.jobs, args)
+        remark = "; ".join(f"{name}: {count}" for name, count in counts.items())
+        rows.append(dict(zip(FIELDS, (trouble, done, lost, damaged, remark), strict=True)))
+        seconds = time.monotonic() - began
+        print(f"{trouble}: {done} rounds, {lost} lost, {damaged} damaged; {remark} ({seconds:.0f} s)", flush=True)
         if args.output:
             with replacing(args.output) as temporary, temporary.open("w", newline="") as file:
                 table = csv.DictWriter(file, FIELDS, lineterminator="\n")
