@@ -156,6 +156,7 @@ def ask(place: Callable[[], Path], stop: Any) -> None:
             writer(place()).close()
         except DatasetError:
             pass
+        time.sleep(0.001)  # leaves the writer a part of the processor
 
 
 def convert_it(place: Callable[[], Path], stop: Any) -> None:
@@ -165,6 +166,7 @@ def convert_it(place: Callable[[], Path], stop: Any) -> None:
             convert(place(), place(), overwrite=True, progress_bar=False)
         except DatasetError:
             pass
+        time.sleep(0.001)
 
 
 def read_it(place: Callable[[], Path], stop: Any, wrong: Any) -> None:
@@ -175,6 +177,7 @@ def read_it(place: Callable[[], Path], stop: Any, wrong: Any) -> None:
             wrong.value += not np.array_equal(seeds, np.arange(len(seeds)))
         except DatasetError as error:
             wrong.value += "does not exist" not in str(error) and "was replaced" not in str(error)
+        time.sleep(0.001)
 
 
 def meetings(folder: Path, rounds: Rounds, rng: random.Random) -> Outcome:

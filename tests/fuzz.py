@@ -36,7 +36,7 @@ from sb3_offline.experiment.config import load_config
 from sb3_offline.experiment.training import create_model, load_run, train
 
 SEED = int(os.environ.get("FUZZ_SEED", "1"))
-SECONDS = 5  # of the processor, after which a signal ends a process that hangs in one input
+SECONDS = 2  # of the processor, after which a signal ends a process that hangs in one input
 CONFIG = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "n_timesteps": 2}
 
 

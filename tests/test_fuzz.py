@@ -34,7 +34,7 @@ def test_drawn_inputs_are_right_or_refused(tmp_path):
         # HDF5 crashed, or hung until a signal ended it: the command that checks files must survive that
         ends[code] = ends.get(code, 0) + 1
         files = [str(file) for file in tmp_path.glob("damaged_*") if kind == "bytes"]
-        verdicts = list(check_all([max(files, key=os.path.getmtime)], seconds=10)) if files else []
+        verdicts = list(check_all([max(files, key=os.path.getmtime)], seconds=3)) if files else []
         if not verdicts or not verdicts[0].damages:
             wrong.append(f"{kind}:{number} ends the process with {code}")
         kinds = [batch[0] for batch in batches]

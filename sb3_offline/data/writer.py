@@ -237,7 +237,8 @@ class DatasetWriter:
             )
         rows = {"episodes/length": np.array([n], np.int64), "episodes/seed": np.array([seed], np.int64)}
         sources = self._header.sources
-        if (source not in sources) if sources is not None else (source is not None):
+        is_known = isinstance(source, str) and sources is not None and source in sources
+        if not is_known and not (sources is None and source is None):
             problem = f"is {source!r}, the file's sources are {sources}"
             raise DatasetError(self.path, "source", problem, "Name one of them, or give all labels when creating the file")
         if sources is not None:
