@@ -6,7 +6,7 @@ TORCH ?= torch==2.13.0
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo demo-pixels states-table test test-slow test-sb3 pytest lint type format check-codestyle commit-checks doc clean
+.PHONY: demo demo-pixels states-table test test-slow test-sb3 fuzz test-chaos pytest lint type format check-codestyle commit-checks doc clean
 
 demo: $(READY)  ## collect data, train CEBORL, evaluate, and report into demo/ (about 15 minutes)
 	$(BIN)/sb3-offline demo --output demo
@@ -26,6 +26,12 @@ test-sb3: $(READY)  ## the test suite of Stable-Baselines3, with each algorithm 
 
 test-slow: $(READY)  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m slow
+
+fuzz: $(READY)  ## 2,000 inputs drawn at random: each is right, or refused in one line (some minutes)
+	FUZZ_INPUTS=2000 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -s tests/test_fuzz.py
+
+test-chaos: $(READY)  ## kill, fill and collide everything that writes, into results/chaos.csv (half an hour)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/chaos.py --output results/chaos.csv
 
 pytest: test
 

@@ -36,6 +36,8 @@ def table(path: Path) -> str:
         return library_table(rows)
     if "change" in rows[0]:
         return checkpoint_table(rows)
+    if "trouble" in rows[0]:
+        return chaos_table(rows)
     if "env_step" in rows[0]:
         return online_table(rows)
     if "std_return" in rows[0]:
@@ -43,6 +45,14 @@ def table(path: Path) -> str:
     if "bound_holds" in rows[0]:
         return world_table(rows)
     return rate_table(rows) if "commit" in rows[0] else result_table(rows)
+
+
+def chaos_table(rows: list[dict[str, str]]) -> str:
+    """A row a kind of trouble."""
+    lines = ["| What happens | Rounds | Lost | Damaged | |", "|---" * 5 + "|"]
+    names = ("rounds", "lost", "damaged")
+    cells = [[row["trouble"].capitalize(), *(f"{int(row[name]):,}" for name in names), row["remark"]] for row in rows]
+    return "\n".join([*lines, *(f"| {' | '.join(line)} |" for line in cells)])
 
 
 def card_table(card: dict[str, Any]) -> str:

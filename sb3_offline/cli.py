@@ -5,6 +5,7 @@ import importlib
 import sys
 
 from sb3_offline.commands import COMMANDS
+from sb3_offline.data.errors import printable
 
 _EXTRAS = {
     "metaworld": "metaworld",
@@ -29,7 +30,7 @@ def main(argv: list[str] | None = None) -> None:
         arguments = _parser(argv[:1]).parse_args(argv)
         arguments.run(arguments)
     except (RuntimeError, ValueError, OSError) as error:
-        sys.exit(f"sb3-offline: {error}")
+        sys.exit(f"sb3-offline: {printable(str(error))}")
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
@@ -38,7 +39,7 @@ def main(argv: list[str] | None = None) -> None:
     except Exception as error:
         if type(error).__module__ != "gymnasium.error":
             raise
-        sys.exit(f"sb3-offline: {error}")
+        sys.exit(f"sb3-offline: {printable(str(error))}")
 
 
 def _parser(chosen: list[str]) -> argparse.ArgumentParser:

@@ -5,6 +5,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from gymnasium import spaces
 
@@ -51,6 +52,13 @@ def write_dataset(
         for episode in episodes:
             writer.add_episode(**episode)
     return episodes
+
+
+def forget_checksums(file: h5py.File) -> None:
+    """Make a file one of a writer that stored no checksums."""
+    del file["episodes/crc"]
+    for name in ("crc_fields", "crc_attributes"):
+        del file.attrs[name]
 
 
 def write_until_killed(path: Path, acknowledged: Path) -> None:

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 import torch as th
-from data_files import write_dataset
+from data_files import forget_checksums, write_dataset
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_algorithms import STATES, ForbiddenEnv
@@ -23,6 +23,7 @@ def paths(tmp_path):
     with h5py.File(tmp_path / "b.h5", "r+") as file:
         file["actions"][:] = file["actions"][:][::-1]
         file["rewards"][:] += 5
+        forget_checksums(file)
     return str(tmp_path / "a.h5"), str(tmp_path / "b.h5")
 
 

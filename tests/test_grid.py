@@ -1,5 +1,6 @@
 """A grid of runs has the same table whether or not processes are killed."""
 
+import contextlib
 import csv
 import json
 import os
@@ -39,8 +40,10 @@ def data(tmp_path_factory):
     return collect_data(tmp_path_factory.mktemp("data"))
 
 
-def run_benchmark(folder, grid, *options):
-    cli.main(["benchmark", grid, "--runs", str(folder / "runs"), "-o", str(folder / "table.csv"), "--workers", "1", *options])
+def run_benchmark(folder, grid, *options, fails=False):
+    arguments = ["--runs", str(folder / "runs"), "-o", str(folder / "table.csv"), "--workers", "1", *options]
+    with pytest.raises(SystemExit, match=r"runs failed; .*table.csv says why") if fails else contextlib.nullcontext():
+        cli.main(["benchmark", grid, *arguments])
     with (folder / "table.csv").open() as file:
         return list(csv.DictReader(file))
 
@@ -124,7 +127,7 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     methods = {"wrong": {"algo": "bc", "config": "bc", "changes": {"batch_size": "many"}}, **GRID["methods"]}
     grid = write_grid(tmp_path, data, methods=methods)
     options = ["--methods", "wrong", "bc", "ceborl", "--tasks", "door-open"]
-    rows = run_benchmark(tmp_path, grid, *options)
+    rows = run_benchmark(tmp_path, grid, *options, fails=True)
     assert [(row["method"], row["step"], row["episodes"]) for row in rows] == [
         (name, step, "1") for name in ("bc", "ceborl", "wrong") for step in ("30", "40")
     ]
@@ -132,7 +135,7 @@ def test_a_failure_is_a_row_and_stops_nothing(data, tmp_path):
     assert rows[0]["config"] == "bc" and rows[0]["commit"] and rows[0]["versions"].startswith("torch ")
     model = tmp_path / "runs/ceborl/door-open-seed3/model.zip"
     before = model.stat().st_mtime_ns
-    again = run_benchmark(tmp_path, grid, *options)
+    again = run_benchmark(tmp_path, grid, *options, fails=True)
     for row in [*rows, *again]:
         del row["commit"]  # the failed run was tried again, perhaps at another commit
     assert again == rows and model.stat().st_mtime_ns == before
@@ -205,7 +208,7 @@ def test_two_processes_write_one_table(data, tmp_path):
 
 def test_a_process_that_dies_again_and_again_is_a_failure(data, tmp_path, monkeypatch):
     monkeypatch.setattr(local, "_work", _die)
-    rows = run_benchmark(tmp_path, write_grid(tmp_path, data), "--methods", "bc", "--tasks", "door-open")
+    rows = run_benchmark(tmp_path, write_grid(tmp_path, data), "--methods", "bc", "--tasks", "door-open", fails=True)
     assert len(rows) == 2 and all("its process died 3 times, with exit code 7" in row["config"] for row in rows)
 
 

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from sb3_offline.data.errors import printable
+
 LONGEST_VALUE = 200
 """Longer values of the provenance are cut off after this number of characters."""
 
@@ -34,7 +36,7 @@ def format_summary(summary: dict[str, Any]) -> str:
     if "examples" in summary:
         lines += ["", f"  {format_examples(summary['examples'])}"]
     warnings = [f"  WARNING {format_warning(warning)}" for warning in summary["warnings"]]
-    return "\n".join([*lines, "", *(warnings or ["  no warnings"])])
+    return printable("\n".join([*lines, "", *(warnings or ["  no warnings"])]))
 
 
 def format_warning(warning: dict[str, str]) -> str:

@@ -68,6 +68,10 @@ class Grid:
     episodes: int = 10
 
     def __post_init__(self) -> None:
+        for kind, names in {"methods": self.methods, "tasks": self.tasks}.items():
+            for name in names:
+                if not name.strip(". ") or not name.isprintable() or set(name) & set('/\\:*?"<>|'):
+                    raise RuntimeError(f"{kind}: {name!r} names files, so it must be a word without slashes; rename it")
         if self.n_timesteps % (2 * self.checkpoints) or self.n_timesteps <= 0:
             raise RuntimeError(
                 f"n_timesteps is {self.n_timesteps}, but {self.checkpoints} checkpoints evenly spaced over the last half "
@@ -163,16 +167,31 @@ def load_grid(name: str) -> Grid:
     for key, (part_kind, what) in parts.items():
         if not all(isinstance(part, part_kind) for part in content[key]):
             raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a list of {what}")
+    if not isinstance(content["env"], str):
+        raise RuntimeError(f"{path}: env: is {content['env']!r}; give the id of an environment")
+    _check_paths(content, f"{path}")
     for key in ("n_timesteps", "save_freq", "checkpoints", "episodes"):
         if key in content and (not isinstance(content[key], int) or content[key] < 1):
             raise RuntimeError(f"{path}: {key}: is {content[key]!r}; give a whole number of at least 1")
     methods = {
         name: Method(**_checked(section, Method, f"{path}: methods: {name}")) for name, section in content["methods"].items()
     }
+    for name, method in methods.items():
+        if not (isinstance(method.algo, str) and isinstance(method.config, str) and isinstance(method.changes, Mapping)):
+            raise RuntimeError(f"{path}: methods: {name}: give texts for algo and config, and a section for changes")
+        _check_paths(method.changes, f"{path}: methods: {name}: changes")
     try:
         return Grid(**{**content, "methods": methods})
     except RuntimeError as error:
         raise RuntimeError(f"{path}: {error}") from error
+
+
+def _check_paths(section: Mapping[str, Any], place: str) -> None:
+    dataset, examples = section.get("dataset", ""), section.get("examples", "")
+    if not isinstance(dataset, str) and not (isinstance(dataset, list) and all(isinstance(part, str) for part in dataset)):
+        raise RuntimeError(f"{place}: dataset: is {dataset!r}; give a path, a pattern, or a list of these")
+    if not isinstance(examples, str | None):
+        raise RuntimeError(f"{place}: examples: is {examples!r}; give a path")
 
 
 def _checked(section: Any, kind: type, place: str) -> dict[str, Any]:

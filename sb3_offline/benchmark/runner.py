@@ -1,7 +1,8 @@
 """Train a grid and write its table."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from sb3_offline.benchmark.grid import Cell, Grid, GridRun
@@ -10,6 +11,8 @@ from sb3_offline.data.reader import open_datasets
 from sb3_offline.experiment.policy_file import save_policy
 from sb3_offline.experiment.run import MODEL_FILE
 from sb3_offline.experiment.training import load_run
+
+DAMAGED_MODEL = "model.damaged.zip"
 
 
 def run_grid(
@@ -30,6 +33,8 @@ def run_grid(
     began = time.monotonic()
     write = table_writer(output, grid, cells)
     trainings = list({run.folder: run for run in cells.values()}.values())
+    if train:
+        yield from _set_damaged_models_aside(trainings)
     unfinished = [run for run in trainings if not run.is_finished()] if train else []
     _check_files(unfinished)
     write()
@@ -38,6 +43,22 @@ def run_grid(
         write()
         minutes = (time.monotonic() - began) / 60
         yield f"[{number}/{len(unfinished)}, {minutes:.0f} min] {run.label}: {_outcome(run)}"
+
+
+def _set_damaged_models_aside(runs: Sequence[GridRun]) -> Iterator[str]:
+    """Give damaged models of finished runs another name, so that these runs, and no others, are trained again."""
+    for run in runs:
+        model = run.folder / MODEL_FILE
+        if not model.is_file():
+            continue
+        try:
+            with zipfile.ZipFile(model) as archive:
+                damaged = archive.testzip()
+        except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError) as error:
+            damaged = " ".join(str(error).split())
+        if damaged is not None:
+            model.replace(model.with_name(DAMAGED_MODEL))
+            yield f"{model}: is damaged ({damaged}), so this run starts again; the file is kept as {DAMAGED_MODEL}"
 
 
 def export_policies(cells: Mapping[Cell, GridRun], runs: Path, folder: Path) -> int:

@@ -1,13 +1,13 @@
 """The two CSV files of a grid: one with a row for each checkpoint that counts, one with a row for each evaluation."""
 
 import csv
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_offline.benchmark.grid import Cell, Grid, GridRun
-from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE
+from sb3_offline.benchmark.worker import FAILURE_FILE, PROVENANCE_FILE, read_texts
+from sb3_offline.data.disk import is_full_disk, wait_for_room
 from sb3_offline.data.files import locked_folder, replacing
 
 FIELDS = ("method", "task", "seed", "step", "episodes", "successes", "config", "commit", "versions")
@@ -26,6 +26,15 @@ def table_writer(output: Path, grid: Grid, cells: Mapping[Cell, GridRun]) -> Cal
 
     def write() -> None:
         output.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                return write_once()
+            except OSError as error:
+                if not is_full_disk(error, output.parent):
+                    raise
+                wait_for_room(output.parent)
+
+    def write_once() -> None:
         with locked_folder(output.parent):  # another process may write other cells of the same table
             for path, fields, rows_of in files:
                 rows = [*_rows_of(path, {*order} - {*cells}, fields), *rows_of(cells)]
@@ -48,13 +57,13 @@ def table_rows(cells: Mapping[Cell, GridRun]) -> list[dict[str, Any]]:
         grid = run.grid
         reached = run.table(task).rows(grid.n_timesteps) if run.training.is_recorded() else []
         found = {int(row["step"]): row for row in reached}
-        provenance = run.folder / PROVENANCE_FILE
+        provenance = {"commit": "", "versions": "", **read_texts(run.folder / PROVENANCE_FILE)}
         missing: dict[str, Any] = {"episodes": grid.episodes, "successes": 0}
         for step in grid.evaluation_steps():
             row = {"method": method, "task": task, "seed": seed, "step": step}
             row |= {name: int(found.get(step, missing)[name]) for name in missing}
             row["config"] = f"{grid.methods[method]}" + (f" (failed: {failure})" if failure else "")
-            row |= json.loads(provenance.read_text()) if provenance.is_file() else {"commit": "", "versions": ""}
+            row |= {name: provenance[name] for name in ("commit", "versions")}
             rows.append(row)
     return rows
 
@@ -97,7 +106,11 @@ def _rows_of(path: Path, wanted: set[Cell], fields: Sequence[str]) -> list[dict[
             raise RuntimeError(
                 f"{path}: is not a table of sb3-offline benchmark and would be overwritten; name another --output"
             )
-        return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in wanted]
+        try:
+            return [row for row in reader if (row["method"], row["task"], int(row["seed"])) in wanted]
+        except (ValueError, TypeError, csv.Error) as error:
+            problem = f"{path}: line {reader.line_num} is damaged ({error})"
+            raise RuntimeError(f"{problem}; remove the file: the runs of all cells write it again") from error
 
 
 def failure_of(run: GridRun) -> str | None:
@@ -105,9 +118,8 @@ def failure_of(run: GridRun) -> str | None:
     :param run: a run
     :return: the error that ended the run, or ``None``
     """
-    file = run.folder / FAILURE_FILE
-    failure = json.loads(file.read_text()) if file.is_file() else {}
-    return failure["error"] if failure.get("run") == run.training.record() else None
+    failure = read_texts(run.folder / FAILURE_FILE)
+    return str(failure.get("error")) if failure.get("run") == run.training.record() else None
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], fields: Sequence[str] = FIELDS) -> None:

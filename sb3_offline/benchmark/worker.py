@@ -3,14 +3,18 @@
 import json
 import os
 import traceback
+import warnings
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_offline.benchmark.grid import GridRun
 from sb3_offline.common.provenance import TRAINING_PACKAGES, current_commit, installed_versions
+from sb3_offline.data.disk import is_full_disk, wait_for_room
 from sb3_offline.data.files import lock_file, replacing
+from sb3_offline.experiment.run import RunInUseError
 from sb3_offline.experiment.training import train_run
 
 FAILURE_FILE, PROVENANCE_FILE, LOCK_FILE = "failure.json", "provenance.json", "lock"
@@ -34,12 +38,20 @@ def complete_run(run: GridRun) -> None:
         if run.is_finished():
             (run.folder / FAILURE_FILE).unlink(missing_ok=True)  # a kill may have come before the removal below
             return
-        try:
-            train_run(run.training, callbacks=[_Provenance(run.folder / PROVENANCE_FILE), *run.tables()], progress_bar=False)
-        except Exception as error:
-            record_failure(run, f"{type(error).__name__}: {error}", traceback.format_exc())
-        else:
-            (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+        while True:
+            try:
+                callbacks = [_Provenance(run.folder / PROVENANCE_FILE), *run.tables()]
+                train_run(run.training, callbacks=callbacks, progress_bar=False)
+            except RunInUseError:
+                raise
+            except Exception as error:
+                if is_full_disk(error, run.folder):  # not a mistake of this run: it goes on from its last save
+                    wait_for_room(run.folder)
+                    continue
+                record_failure(run, f"{type(error).__name__}: {error}", traceback.format_exc())
+            else:
+                (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+            return
 
 
 def record_failure(run: GridRun, error: str, details: str = "") -> None:
@@ -56,6 +68,21 @@ def record_failure(run: GridRun, error: str, details: str = "") -> None:
         temporary.write_text(json.dumps(failure, indent=1))
 
 
+def read_texts(file: Path) -> dict[str, Any]:
+    """
+    :param file: a JSON file that this module wrote
+    :return: its entries; none if there is no such file, or if it is damaged, which is said in a warning
+    """
+    try:
+        found = json.loads(file.read_text()) if file.is_file() else {}
+    except (OSError, ValueError) as error:
+        found = " ".join(str(error).split())
+    if not isinstance(found, dict):
+        warnings.warn(f"{file}: is damaged ({found[:200]}) and is ignored.")
+        return {}
+    return found
+
+
 class _Provenance(BaseCallback):
     """Records commit and package versions beside a run: several of each if the run continued with other code."""
 
@@ -66,7 +93,7 @@ class _Provenance(BaseCallback):
     def _on_training_start(self) -> None:
         versions = ", ".join(f"{name} {version}" for name, version in installed_versions(TRAINING_PACKAGES).items())
         now = {"commit": current_commit(), "versions": versions}
-        before = json.loads(self.path.read_text()) if self.num_timesteps and self.path.is_file() else {}
+        before = read_texts(self.path) if self.num_timesteps else {}
         for name, earlier in before.items():
             is_same = earlier.split(THEN)[-1] == now[name]
             now[name] = earlier if is_same else earlier + THEN + now[name]

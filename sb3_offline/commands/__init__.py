@@ -14,6 +14,7 @@ COMMANDS = {
     "examples": "draw success examples from a labelled dataset",
     "label": "find the successful episodes of a dataset by success examples, without labels",
     "inspect": "show the content of a dataset and likely mistakes in it",
+    "check": "check files and runs for damage",
     "render": "draw the frames of a dataset again, with another size or camera",
     "convert": "compress or uncompress a dataset, or convert it from and to other libraries",
     "train": "train one policy",

@@ -3,12 +3,15 @@
 import argparse
 import functools
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from sb3_offline.benchmark.grid import load_grid, plan
 from sb3_offline.benchmark.local import train_locally
 from sb3_offline.benchmark.runner import export_policies, run_grid
+from sb3_offline.benchmark.table import failure_of
+from sb3_offline.data.errors import printable
 from sb3_offline.data.files import check_outputs
 
 
@@ -50,6 +53,9 @@ def run(args: argparse.Namespace) -> None:
     grid = load_grid(args.grid)
     cells = plan(grid, args.runs, grid.cells(args.methods, args.tasks, args.seeds))
     for line in run_grid(grid, cells, args.output, train):
-        print(line, flush=True)
+        print(printable(line), flush=True)
     if args.policies:
         print(f"{export_policies(cells, args.runs, args.policies)} policies -> {args.policies}")
+    failed = {run.label for run in cells.values() if failure_of(run)}
+    if failed and train is not None:
+        sys.exit(f"sb3-offline: {len(failed)} runs failed; {args.output} says why, in its column config")

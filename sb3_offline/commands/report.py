@@ -12,6 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for report.md and its figures")
     parser.add_argument("--runs", nargs="+", type=Path, default=[], help="folder of the runs of each table, for film strips")
     parser.add_argument("--reference", default="ceborl", help="the method that others are compared with (default: ceborl)")
+    parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
     parser.add_argument("--notes", type=Path, help="a Markdown file to begin the report with")
 
 
@@ -20,5 +21,5 @@ def run(args: argparse.Namespace) -> None:
     from sb3_offline.report.report import write_report  # needs the extra report
 
     check_outputs([args.output / "report.md"], [*args.tables, args.notes])
-    for line in write_report(args.tables, args.output, args.runs, args.reference, args.notes):
+    for line in write_report(args.tables, args.output, args.runs, args.reference, args.notes, trust=args.trust):
         print(line, flush=True)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.errors import DatasetError, damaged_file
 from sb3_offline.data.files import open_hdf5
 from sb3_offline.data.format import Field
 
@@ -127,12 +127,17 @@ class HDF5Array:
         :param rows: an index, a slice, or an array of indices
         :return: these rows. Scattered indices are slow, because whole chunks are decompressed: convert the file for training
         """
+        if isinstance(rows, slice):
+            return self._read(slice(*rows.indices(len(self))))
+        indices, inverse = np.unique(np.arange(len(self))[rows], return_inverse=True)
+        return self._read(indices)[inverse.reshape(np.shape(rows))]
+
+    def _read(self, rows: slice | np.ndarray) -> np.ndarray:
         with open_hdf5(self.path) as file:
-            array = file[self.name]
-            if isinstance(rows, slice):
-                return array[slice(*rows.indices(len(self)))]
-            indices, inverse = np.unique(np.arange(len(self))[rows], return_inverse=True)
-            return array[indices][inverse.reshape(np.shape(rows))]
+            try:
+                return file[self.name][rows]
+            except (OSError, RuntimeError, KeyError) as error:  # HDF5 finds a chunk damaged when it is decompressed
+                raise damaged_file(self.path, error, self.name) from error
 
     def take(self, rows: np.ndarray, axis: int = 0) -> np.ndarray:
         """

@@ -5,12 +5,14 @@ import os
 from pathlib import Path
 
 import h5py
+import numpy as np
 from tqdm.auto import tqdm
 
+from sb3_offline.data.checksums import RunningChecksums, counts_of, damage
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import WriteLock, check_outputs, replacing
 from sb3_offline.data.foreign.registry import format_of_name, write_foreign
-from sb3_offline.data.format import CHUNK_BYTES, Storage, create_file
+from sb3_offline.data.format import CHECKSUMS, CHUNK_BYTES, Storage, checksum_columns, create_file
 from sb3_offline.data.reader import OfflineDataset
 
 PIECE_BYTES = 1 << 25
@@ -34,8 +36,8 @@ def convert(
     :param storage: "contiguous" or "compressed" (gzip), for a file
     :param overwrite: replace an existing file
     :param progress_bar: show the progress
-    :raises DatasetError: if the dataset cannot be opened, if the destination exists and ``overwrite`` is false, if it is a
-        file of a dataset of another library, or if another process writes it
+    :raises DatasetError: if the dataset cannot be opened, if its episodes do not match their checksums, if the destination
+        exists and ``overwrite`` is false, if it is a file of a dataset of another library, or if another process writes it
     """
     opened = dataset if isinstance(dataset, OfflineDataset) else OfflineDataset(dataset)
     foreign = format_of_name(os.fspath(destination))
@@ -56,12 +58,21 @@ def convert(
         bar.set_description(f"{opened.path.name} -> {storage}")
         create_file(temporary, opened.header, opened.n_episodes, opened.n_steps, committed=opened.n_episodes, storage=storage)
         with h5py.File(temporary, "r+", locking=False) as file:
-            for name, spec in fields.items():
-                array = opened.arrays[name]
+            checksums = np.zeros((opened.n_episodes, len(fields)), np.uint32)
+            for column, name in enumerate(checksum_columns(fields)):
+                array, spec = opened.arrays[name], fields[name]
+                running = RunningChecksums(counts_of(name, opened.lengths))
                 # Whole chunks at a time, so that none is compressed twice
                 chunk = max(CHUNK_BYTES // max(spec.row_bytes, 1), 1)
                 rows = max(PIECE_BYTES // max(spec.row_bytes, 1) // chunk, 1) * chunk
                 for first in range(0, len(array), rows):
                     last = min(first + rows, len(array))
-                    file[name][first:last] = array[first:last]
+                    piece = np.asarray(array[first:last], spec.dtype)
+                    file[name][first:last] = piece
+                    running.update(piece)
                     bar.update((last - first) * spec.row_bytes)
+                checksums[:, column] = running.values
+                if opened.checksums is not None and (wrong := running.values != opened.checksums.of(name)).any():
+                    raise damage(opened.path, name, np.flatnonzero(wrong).tolist())
+            if opened.n_episodes:
+                file[CHECKSUMS][:] = checksums

@@ -1,6 +1,25 @@
 """The error that bad data raise."""
 
 import os
+import pickle
+import struct
+import zipfile
+import zlib
+
+
+def printable(text: str) -> str:
+    """
+    :param text: a text with words of a file
+    :return: the text for a terminal, which control characters could steer; ends of lines stay
+    """
+    return "".join(letter if letter.isprintable() or letter == "\n" else f"\\x{ord(letter):02x}" for letter in text)
+
+
+#: What HDF5, zip archives, NumPy and JSON raise when they read damaged bytes
+DAMAGE_ERRORS = (
+    *(OSError, RuntimeError, KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, MemoryError),
+    *(EOFError, AssertionError, zipfile.BadZipFile, zlib.error, struct.error, pickle.UnpicklingError),
+)
 
 
 class DatasetError(RuntimeError):
@@ -22,6 +41,15 @@ class DatasetError(RuntimeError):
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.file else self.field
-        text = " ".join(f"{place}: {self.problem}. {self.remedy}.".splitlines())
-        # The words of a file reach the terminal here: control characters in them must not
-        return "".join(character if character.isprintable() else f"\\x{ord(character):02x}" for character in text)
+        return printable(" ".join(f"{place}: {self.problem}. {self.remedy}.".splitlines()))
+
+
+def damaged_file(path: str | os.PathLike, error: BaseException, field: str = "file") -> DatasetError:
+    """
+    :param path: a file
+    :param error: the error of a library that read it
+    :param field: the array or attribute that was read
+    :return: the error for the user
+    """
+    problem = f"cannot be read ({' '.join(str(error).split())})"
+    return DatasetError(path, field, problem, "The file is damaged: take a copy, or write it again")

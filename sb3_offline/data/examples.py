@@ -12,13 +12,14 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.files import WriteLock, open_hdf5, replacing
 from sb3_offline.data.plain import check_all_plain, check_stored, is_text, read_attribute
 from sb3_offline.data.spaces import check_observations, space_to_json, subspace, to_array
 
 EXAMPLES_FORMAT = "sb3-offline-examples"
 EXAMPLES_VERSION = 1
+ARRAY_CRC = "crc"  # attribute of each array: its CRC-32
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Pillow's modes with 8 bits per channel. It would clip images of other modes (16-bit PNGs) to white
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
@@ -174,7 +175,7 @@ def _write(
         file.attrs["observation_space"] = space_to_json(observation_space)
         file.attrs["provenance"] = json.dumps(dict(provenance or {}))
         for name, array in arrays.items():
-            file.create_dataset(name, data=array)
+            file.create_dataset(name, data=array).attrs[ARRAY_CRC] = np.uint32(zlib.crc32(np.ascontiguousarray(array).data))
 
 
 def _read_hdf5(path: Path) -> Observations:
@@ -192,11 +193,10 @@ def _read_hdf5(path: Path) -> Observations:
             if isinstance(node, h5py.Dataset):
                 return _read_array(node, path)
             return {key: _read_array(array, path) for key, array in node.items()}
-        except (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
-            if isinstance(error, DatasetError):
-                raise
-            problem = f"cannot be read ({' '.join(str(error).split())})"
-            raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+        except DatasetError:
+            raise
+        except DAMAGE_ERRORS as error:
+            raise damaged_file(path, error) from error
 
 
 def _read_array(array: Any, path: Path) -> np.ndarray:
@@ -206,7 +206,13 @@ def _read_array(array: Any, path: Path) -> np.ndarray:
     size = os.fstat(array.file.id.get_vfd_handle()).st_size
     row_bytes = int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
     check_stored(array, array.shape[0], row_bytes, size, path)
-    return array[()]
+    values = array[()]
+    stored = read_attribute(array, ARRAY_CRC)
+    if stored is not None and not (isinstance(stored, np.integer) and stored == zlib.crc32(np.ascontiguousarray(values).data)):
+        problem = "does not match the checksum that was written with it"
+        remedy = f"Copy the file again. If you changed the array yourself, delete its attribute {ARRAY_CRC}"
+        raise DatasetError(path, array.name.lstrip("/"), problem, remedy)
+    return values
 
 
 def _read_numpy(path: Path, space: spaces.Space) -> Observations:

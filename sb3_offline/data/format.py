@@ -8,6 +8,7 @@ observations than it has steps, so that no observation is stored twice.
 import json
 import operator
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,10 @@ CHUNK_BYTES = 50 * 64 * 64 * 3
 # Kinds of dtypes of extras: flags, numbers, and texts of a fixed length. Others, such as references, records and texts of
 # variable length, would point to other places in the file.
 EXTRA_KINDS = "biufS"
+
+# The checksums: an array with a row for each episode, and attributes that later writers and readers of version 1 may lack.
+CHECKSUMS = "episodes/crc"
+COLUMNS, ATTRIBUTES_CRC = "crc_fields", "crc_attributes"
 
 Storage = Literal["contiguous", "compressed"]
 
@@ -103,8 +108,8 @@ class Header:
             fields["rewards"] = Field("step", (), np.dtype(np.float32))
         for name in ("terminated", "truncated") + (("success",) if self.success else ()):
             fields[name] = Field("step", (), np.dtype(bool))
-        for name, (shape, dtype) in self.extras.items():
-            fields[f"extras/{name}"] = _extra_field(name, shape, dtype)
+        for name, declared in self.extras.items():
+            fields[f"extras/{name}"] = _extra_field(name, declared)
         return fields
 
     def attributes(self) -> dict[str, Any]:
@@ -121,15 +126,16 @@ class Header:
         return attributes if self.sources is None else {**attributes, "sources": json.dumps(self.sources)}
 
 
-def _extra_field(name: str, shape: Any, dtype: Any) -> Field:
+def _extra_field(name: str, declared: Any) -> Field:
     """:return: the field of an extra; raises ``DatasetError`` if a file cannot hold it as a plain array"""
     field = f"extras/{name}"
     if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or "\0" in name:
         raise DatasetError("", field, "is no name of an array", "Give a name without a slash")
     try:
+        shape, dtype = declared
         spec = Field("step", tuple(operator.index(size) for size in shape), np.dtype(dtype))
-    except TypeError as error:
-        raise DatasetError("", field, f"is declared as {(shape, dtype)!r}", "Give (shape of one row, dtype)") from error
+    except (TypeError, ValueError) as error:
+        raise DatasetError("", field, f"is declared as {declared!r:.100}", "Give (shape of one row, dtype)") from error
     if spec.dtype.kind not in EXTRA_KINDS or spec.dtype.itemsize == 0 or min(spec.shape, default=0) < 0:
         problem = f"has rows of shape {spec.shape} and dtype {spec.dtype}"
         raise DatasetError("", field, problem, "Use numbers, flags, or texts of a fixed length ('S10')")
@@ -210,6 +216,31 @@ def _decode_texts(text: str) -> list[str]:
     return value
 
 
+def checksum_columns(fields: Mapping[str, Field]) -> list[str]:
+    """
+    :param fields: the arrays of a file
+    :return: their names, in the order of the columns of their checksums
+    """
+    return sorted(fields)
+
+
+def checksum_field(fields: Mapping[str, Field]) -> Field:
+    """
+    :param fields: the arrays of a file
+    :return: the array of their checksums
+    """
+    return Field("episode", (len(fields),), np.dtype(np.uint32))
+
+
+def attributes_crc(attributes: Mapping[str, Any]) -> int:
+    """
+    :param attributes: the attributes of a file, without their checksum
+    :return: their checksum (CRC-32)
+    """
+    lines = "".join(f"{name}={attributes[name]}\n" for name in sorted(attributes))
+    return zlib.crc32(lines.encode(errors="surrogatepass"))
+
+
 def create_file(
     path: Path, header: Header, n_episodes: int, n_steps: int, *, committed: int, storage: Storage = "contiguous"
 ) -> None:
@@ -229,9 +260,11 @@ def create_file(
         raise TypeError(f"storage is {storage!r}; choose 'contiguous' or 'compressed'")
     # Arrays begin at whole pages, so that reading a memory-mapped row touches as few pages as possible.
     with h5py.File(path, "w", locking=False, alignment_threshold=4096, alignment_interval=4096) as file:
-        for name, value in header.attributes().items():
+        fields = header.fields()
+        attributes = {**header.attributes(), COLUMNS: json.dumps(checksum_columns(fields))}
+        for name, value in {**attributes, ATTRIBUTES_CRC: np.uint32(attributes_crc(attributes))}.items():
             file.attrs[name] = value
-        for name, spec in header.fields().items():
+        for name, spec in {**fields, CHECKSUMS: checksum_field(fields)}.items():
             _create_array(file, name, (spec.rows(n_episodes, n_steps), *spec.shape), spec, storage)
         _create_array(file, "n_episodes", (), Field("episode", (), np.dtype(np.int64)), "contiguous")
         file["n_episodes"][()] = committed

@@ -8,7 +8,8 @@ import h5py
 import numpy as np
 
 from sb3_offline.data.arrays import ArrayLike, HDF5Array, MappedArray, MappedFile
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.checksums import Checksums, read_checksums
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.format import FORMAT, Header, Storage, read_header
 from sb3_offline.data.plain import check_plain, check_stored, is_text, read_attribute
 
@@ -23,11 +24,13 @@ class Native(NamedTuple):
     :param header: spaces, attributes, and which arrays there are
     :param arrays: by name, as ``Header.fields`` names them
     :param storage: how the file stores its arrays
+    :param checksums: the checksums of its episodes, which have not been compared with the arrays; ``None`` if it has none
     """
 
     header: Header
     arrays: dict[str, ArrayLike]
     storage: Storage
+    checksums: Checksums | None
 
 
 def is_native(file: h5py.File) -> bool:
@@ -51,9 +54,8 @@ def read_native(file: h5py.File, path: Path) -> Native:
         return _read(file, path)
     except DatasetError:
         raise
-    except (OSError, RuntimeError, KeyError, IndexError, TypeError, ValueError, OverflowError, MemoryError) as error:
-        problem = f"cannot be read ({' '.join(str(error).split())})"
-        raise DatasetError(path, "file", problem, "The file is damaged: take a copy, or write it again") from error
+    except DAMAGE_ERRORS as error:
+        raise damaged_file(path, error) from error
 
 
 def _read(file: h5py.File, path: Path) -> Native:
@@ -90,7 +92,7 @@ def _read(file: h5py.File, path: Path) -> Native:
             arrays[name] = MappedArray(mapped, offset, rows, spec)
         else:
             arrays[name] = HDF5Array(path, name, rows, spec)
-    return Native(header, arrays, storage)
+    return Native(header, arrays, storage, read_checksums(file, path, fields, n_episodes, found["episodes/length"], size))
 
 
 def _check_integers(array: h5py.Dataset, ndim: int, path: Path, name: str) -> None:

@@ -12,9 +12,9 @@ from sb3_offline.data.errors import DatasetError
 REMEDY = "Open only files from people you trust; copy the arrays into one file (h5repack, or write it again)"
 
 
-def read_attribute(file: h5py.File | h5py.Group, name: str) -> Any:
+def read_attribute(file: h5py.Group | h5py.Dataset, name: str) -> Any:
     """
-    :param file: an open HDF5 file
+    :param file: an open HDF5 file, or an array in it
     :param name: of an attribute
     :return: its value; ``None`` if it is missing or cannot be read
     """

@@ -12,7 +12,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_offline.data.arrays import ArrayLike, MappedArray
 from sb3_offline.data.checks import check_values
-from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.checksums import Checksums, verify
+from sb3_offline.data.errors import DAMAGE_ERRORS, DatasetError, damaged_file
 from sb3_offline.data.foreign.base import Options
 from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.foreign.registry import find_path, read_foreign, recognize, unknown_format
@@ -40,6 +41,8 @@ class OfflineDataset:
       memory maps in contiguous storage, instances of ``HDF5Array`` in compressed storage
     - ``actions`` ``(N, *shape)`` float32 in the units of the environment, ``rewards`` (N,) float32 or ``None``,
       ``terminated``, ``truncated`` (N,) bool, ``success`` (N,) bool or ``None``: in memory
+    - ``checksums``: the checksums that a file of format version 1 stores, or ``None``. Opening compares them with all arrays
+      that it reads: all but images and extras. ``sb3-offline check`` compares them with all arrays
     - ``storage``: "contiguous", "compressed", or "memory" (data of other libraries, or selected episodes)
 
     Any number of datasets may be open at a time: only some of their files are kept open, and the others are opened again when
@@ -66,6 +69,7 @@ class OfflineDataset:
         trust: bool = False,
     ):
         self.storage: Storage | str = "memory"
+        self.checksums: Checksums | None = None
         self._options: dict[str, Any] = {
             "observation_space": observation_space,
             "action_space": action_space,
@@ -76,11 +80,21 @@ class OfflineDataset:
         self._given = find_path(path) if isinstance(path, str | os.PathLike) else path
         with Probe(self._given) as probe:
             self.path = probe.path
-            self.header, arrays = self._read(probe, Options(observation_space, action_space, max_episode_steps))
+            try:
+                self.header, arrays = self._read(probe, Options(observation_space, action_space, max_episode_steps))
+            except DAMAGE_ERRORS as error:
+                if probe.is_object or isinstance(error, DatasetError):
+                    raise
+                raise damaged_file(self.path, error) from error
         if episodes is not None:
             indices = self._options["episodes"] = _episode_indices(episodes, len(arrays["episodes/length"]), self.path)
             arrays, self.storage = _selected(arrays, indices), "memory"
+            if self.checksums is not None:
+                self.checksums = Checksums(self.checksums.names, self.checksums.values[indices])
         check_values(self.header, arrays, self.path)
+        if self.checksums is not None:
+            names = [name for name, array in arrays.items() if _is_read_on_opening(name, array)]
+            verify(arrays, self.checksums, names, self.path, self._options["episodes"])
         self.arrays: dict[str, Any] = arrays
         self.observation_space, self.action_space = self.header.observation_space, self.header.action_space
         self.env_id, self.env_kwargs, self.provenance = self.header.env_id, self.header.env_kwargs, self.header.provenance
@@ -97,7 +111,7 @@ class OfflineDataset:
     def _read(self, probe: Probe, options: Options) -> tuple[Header, dict[str, Any]]:
         if probe.hdf5 is not None and is_native(probe.hdf5):
             self._declares_spaces = True
-            header, native_arrays, self.storage = read_native(probe.hdf5, probe.path)
+            header, native_arrays, self.storage, self.checksums = read_native(probe.hdf5, probe.path)
             return header, native_arrays
         if probe.hdf5 is not None:
             check_all_plain(probe.hdf5, probe.path)
@@ -147,6 +161,13 @@ class OfflineDataset:
         return _reopen, (self._given, self._options)
 
 
+def _is_read_on_opening(name: str, array: ArrayLike) -> bool:
+    """:return: whether an array is in memory, or its floats were read from a memory map to see that they are finite"""
+    if isinstance(array, MappedArray):
+        return array.dtype.kind == "f" and not name.startswith("extras/")
+    return isinstance(array, np.ndarray)
+
+
 def _reopen(path: Any, options: dict[str, Any]) -> OfflineDataset:
     return OfflineDataset(path, **options)
 
@@ -158,7 +179,13 @@ def _as_plain(array: ArrayLike) -> Any:
 
 def _episode_indices(episodes: Sequence[int] | np.ndarray, n_episodes: int, path: Path) -> np.ndarray:
     """:return: int64 indices, of a list of indices or a mask"""
-    given = np.asarray(episodes)
+    try:
+        given = np.asarray(episodes)
+    except ValueError:
+        given = np.empty(())
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iub"):
+        problem = f"is {episodes!r:.100}"
+        raise DatasetError(path, "episodes", problem, "Give a list of whole numbers, or one flag for each episode")
     if given.dtype == bool and len(given) != n_episodes:
         problem = f"is a mask of {len(given)} flags, but there are {n_episodes} episodes"
         raise DatasetError(path, "episodes", problem, "Give one flag for each episode")

@@ -10,9 +10,10 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.checks import BOTH_ENDS
+from sb3_offline.data.checksums import array_checksums, counts_of, row_checksums
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.files import WriteLock, open_hdf5, remove_leftovers, replacing
-from sb3_offline.data.format import Header, create_file, read_header
+from sb3_offline.data.format import CHECKSUMS, Field, Header, checksum_columns, checksum_field, create_file, read_header
 from sb3_offline.data.native import read_native
 from sb3_offline.data.spaces import check_choices, check_extra, check_observations, check_rows, to_array
 
@@ -72,7 +73,15 @@ class DatasetWriter:
         self.n_steps = 0
         self._file: Any = None
         self._lock: WriteLock | None = None  # held until the writer is closed, also while the file is replaced
+        self._adopted_checksums: np.ndarray | None = None  # of the episodes of a file that has no checksums
         self._replaces = False  # whether the file is still to be created, or is an old one that is still to be replaced
+        for name, value in (("env_kwargs", env_kwargs), ("provenance", provenance), ("extras", extras)):
+            if value is not None and not isinstance(value, Mapping):
+                raise DatasetError(self.path, name, f"is {value!r:.100}", "Give a dict")
+        if not isinstance(env_id, str):
+            raise DatasetError(self.path, "env_id", f"is {env_id!r:.100}", "Give the id as a text, or none")
+        if sources is not None and (isinstance(sources, str) or not all(isinstance(s, str) for s in _listed(sources))):
+            raise DatasetError(self.path, "sources", f"is {sources!r:.100}", "Give a list of texts")
         self._header = Header(
             observation_space,
             action_space,
@@ -86,6 +95,7 @@ class DatasetWriter:
         )
         try:
             self._fields = self._header.fields()
+            self._stored: dict[str, Field] = {**self._fields, CHECKSUMS: checksum_field(self._fields)}
         except DatasetError as error:
             raise DatasetError(self.path, error.field, error.problem, error.remedy) from error
         try:
@@ -95,7 +105,11 @@ class DatasetWriter:
             raise
 
     def _open(self, mode: str, capacity: tuple[int, int]) -> None:
-        self._header.attributes()  # raises early if an attribute cannot be stored
+        try:
+            self._header.attributes()  # raises early if an attribute cannot be stored
+        except (TypeError, ValueError) as error:
+            problem = f"cannot be stored as JSON ({error})"
+            raise DatasetError(self.path, "env_kwargs, provenance", problem, "Give numbers, texts, lists and dicts") from error
         self._lock = WriteLock(self.path)
         remove_leftovers(self.path)
         exists = self.path.exists()
@@ -152,10 +166,13 @@ class DatasetWriter:
             truncated = np.zeros(n, dtype=bool)
             truncated[-1] = not terminated[-1]
         steps = {"actions": actions, "rewards": rewards, "terminated": terminated, "truncated": truncated, "success": success}
+        if extras is not None and not isinstance(extras, Mapping):
+            raise DatasetError(self.path, "extras", f"is {extras!r:.100}", "Give a dict of arrays")
         steps |= {f"extras/{name}": value for name, value in (extras or {}).items()}
         rows = check_observations(observations, self._header.observation_space, n + 1, self.path)
         rows |= self._check_steps({name: value for name, value in steps.items() if value is not None}, n)
         rows |= self._episode_rows(n, seed, source)
+        rows[CHECKSUMS] = row_checksums(rows, self._fields)
         if self._replaces:
             self._rewrite((self._capacity[0], max(self._capacity[1], n)), rows)
         else:
@@ -220,7 +237,8 @@ class DatasetWriter:
             )
         rows = {"episodes/length": np.array([n], np.int64), "episodes/seed": np.array([seed], np.int64)}
         sources = self._header.sources
-        if (source not in sources) if sources is not None else (source is not None):
+        is_known = isinstance(source, str) and sources is not None and source in sources
+        if not is_known and not (sources is None and source is None):
             problem = f"is {source!r}, the file's sources are {sources}"
             raise DatasetError(self.path, "source", problem, "Name one of them, or give all labels when creating the file")
         if sources is not None:
@@ -231,8 +249,8 @@ class DatasetWriter:
         if self.n_episodes + 1 > self._capacity[0] or self.n_steps + n > self._capacity[1]:
             self._rewrite((2 * self._capacity[0], 2 * self._capacity[1] + n))
         for name, array in rows.items():
-            first_row = self._fields[name].rows(self.n_episodes, self.n_steps)
-            self._write(self._offsets[name] + first_row * self._fields[name].row_bytes, array)
+            spec = self._stored[name]
+            self._write(self._offsets[name] + spec.rows(self.n_episodes, self.n_steps) * spec.row_bytes, array)
         os.fsync(self._file.fileno())  # the order matters: first the rows must be on disk, then the number that counts them
         self._write(self._offsets["n_episodes"], np.array(self.n_episodes + 1, dtype=np.int64))
 
@@ -246,18 +264,21 @@ class DatasetWriter:
         self._file = open(self.path, "r+b", buffering=0)
 
     def _read_places(self, file: h5py.File) -> None:
-        self._offsets = {name: file[name].id.get_offset() or 0 for name in [*self._fields, "n_episodes"]}
+        self._offsets = {name: file[name].id.get_offset() or 0 for name in [*self._stored, "n_episodes"] if name in file}
         self._capacity = (len(file["episodes/length"]), len(file["actions"]))
 
     def _adopt(self) -> None:
         """Take over the episodes and the header of the existing file."""
         with open_hdf5(self.path) as file:
             read_header(file, self.path)  # the error for a file of another format
-            present, arrays, storage = read_native(file, self.path)  # checks that the places are in this very file
+            present, arrays, storage, checksums = read_native(file, self.path)  # checks that the places are in this very file
             self._check_same(present, storage == "compressed")
             self._read_places(file)
-            self.n_episodes = len(arrays["episodes/length"])
-            self.n_steps = int(np.asarray(arrays["episodes/length"]).sum())
+            lengths = np.asarray(arrays["episodes/length"])
+            self.n_episodes, self.n_steps = len(lengths), int(lengths.sum())
+            if checksums is None:
+                columns = [array_checksums(arrays[name], counts_of(name, lengths)) for name in checksum_columns(self._fields)]
+                self._adopted_checksums = np.stack(columns, axis=1)
         header, new_provenance = self._header, self._header.provenance
         header.env_id, header.env_kwargs = present.env_id, present.env_kwargs
         if header.sources is not None and present.sources is not None:
@@ -291,13 +312,22 @@ class DatasetWriter:
                         file[name][: len(array)] = array
             if self.n_episodes:
                 with open_hdf5(temporary) as file, open(temporary, "r+b", buffering=0) as target:
-                    for name, spec in self._fields.items():
-                        size = spec.rows(self.n_episodes, self.n_steps) * spec.row_bytes
-                        _copy(self._file, self._offsets[name], target, file[name].id.get_offset(), size)
+                    for name, spec in self._stored.items():
+                        place, size = file[name].id.get_offset(), spec.rows(self.n_episodes, self.n_steps) * spec.row_bytes
+                        if name in self._offsets:
+                            _copy(self._file, self._offsets[name], target, place, size)
+                        else:
+                            target.seek(place)
+                            _write_all(target, memoryview(self._adopted_checksums.view(np.uint8).reshape(-1)))  # type: ignore
         self._replaces = False
         self._attach()
         with open_hdf5(self.path) as file:
             self._read_places(file)
+
+
+def _listed(values: Any) -> list[Any]:
+    """:return: the values; of something that is no list, a list without texts"""
+    return list(values) if isinstance(values, Sequence | np.ndarray) and np.ndim(values) == 1 else [None]
 
 
 def _copy(origin: Any, origin_offset: int, target: Any, target_offset: int, size: int) -> None:

@@ -14,6 +14,7 @@ import torch as th
 import sb3_offline
 from sb3_offline.ceborl.classifier import RecursiveClassifier
 from sb3_offline.data.examples import save_examples
+from sb3_offline.data.files import replacing
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.data_tools.collecting.scripted import BEHAVIOUR, TASKS, collect_scripted
 from sb3_offline.data_tools.converting.extract_examples import extract_examples
@@ -234,5 +235,6 @@ or task labels.
 Took {seconds / 60:.1f} minutes ({machine}; sb3-offline {sb3_offline.__version__}).
 Settings: `{json.dumps(asdict(settings))}`
 """
-    (output / "report.md").write_text(report)
+    with replacing(output / "report.md") as temporary:
+        temporary.write_text(report, encoding="utf-8")
     return report

@@ -8,6 +8,7 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
+from sb3_offline.data.files import replacing
 from sb3_offline.demo.trajectories import JudgedTrajectories
 from sb3_offline.envs import ENV_ID
 
@@ -33,7 +34,8 @@ def plot_learning_curves(runs: dict[str, Path], path: Path) -> None:
     axes.set(xlabel="gradient steps", ylabel=f"success rate ({episodes} episodes)", ylim=(-0.03, 1.03), xlim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=130)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=130, format=path.suffix[1:])
     plt.close(figure)
 
 
@@ -77,5 +79,6 @@ def plot_classifier(judged: JudgedTrajectories, pair: tuple[int, int], path: Pat
             panel.set_title(f"decision {decision}", fontsize=8, color=COLORS[solved])
             panel.spines[:].set_color(COLORS[solved])
     env.close()
-    figure.savefig(path, dpi=120)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120, format=path.suffix[1:])
     plt.close(figure)

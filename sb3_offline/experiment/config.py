@@ -1,6 +1,7 @@
 """Read hyperparameters from YAML files in the form of the RL Zoo, with one section per environment id."""
 
 import ast
+import math
 import re
 from collections.abc import Sequence
 from importlib import resources
@@ -11,10 +12,33 @@ import yaml
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 3e-4 as a number, as YAML 1.2 and Python do, and not as text."""
+    """
+    Reads 3e-4 as a number, as YAML 1.2 and Python do, and not as text. Refuses keys that a section holds twice, of which one
+    would be lost without a word, and numbers that are not finite.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """See PyYAML."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = str(key.value)
+            if name in seen and name != "<<":
+                problem = f"the key {name!r} is there twice; keep one"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep=deep)
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        """See PyYAML."""
+        value = super().construct_yaml_float(node)
+        if not math.isfinite(value):
+            problem = f"the value {node.value} is no finite number; give one"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        return value
 
 
 _FLOAT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$")
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
 
 
@@ -41,9 +65,9 @@ def read_yaml(name: str, kind: str, folder: str = "") -> tuple[Path, Any]:
         shipped = sorted(file.stem for file in config_path(f"{folder}any").parent.glob("*.yml"))
         raise RuntimeError(f"{path}: there is no such {kind}; give a path, or one of {', '.join(shipped)}")
     try:
-        return path, yaml.load(path.read_text(), _Loader)
-    except yaml.YAMLError as error:
-        raise RuntimeError(f"{path}: is not YAML ({error})") from error
+        return path, yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError, TypeError, OSError) as error:
+        raise RuntimeError(f"{path}: is not YAML that can be used ({' '.join(str(error).split())})") from error
 
 
 def load_config(name: str, env_id: str) -> dict[str, Any]:

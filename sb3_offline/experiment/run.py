@@ -1,8 +1,10 @@
 """The description of one training run, and its record on the disk."""
 
+import contextlib
 import json
 import warnings
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,47 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sb3_offline.data.errors import DatasetError
+from sb3_offline.data.files import WriteLock
 from sb3_offline.data.reader import OfflineDataset
 from sb3_offline.experiment.data import given_data
 
 MODEL_FILE, CONFIG_FILE = "model.zip", "config.yml"
 # Record of a run that is to replace a finished one, whose files stay until the new model is whole.
 PENDING_FILE = "config.pending.yml"
+# Everything that a killed run needs to continue.
+RESUME_FILE = "resume.zip"
+
+
+class RunInUseError(DatasetError):
+    """Another process trains in the folder of the run."""
+
+
+@contextlib.contextmanager
+def locked_run(folder: Path) -> Iterator[None]:
+    """
+    Lock the folder of a run, since two runs would mix their files. A folder in which nothing is written is removed again.
+
+    :param folder: the folder, which is created
+    :raises RunInUseError: if another process trains in it
+    :raises DatasetError: if it cannot be written to
+    """
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        lock = WriteLock(folder / "run")
+    except DatasetError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise
+        problem = error.problem.replace("being written by", "in use by")
+        remedy = "Wait until that run has ended, or name another folder"
+        raise RunInUseError(folder, "folder", problem, remedy) from error
+    try:
+        yield
+    finally:
+        lock.release()
+        with contextlib.suppress(OSError):  # not empty
+            for place in created:
+                place.rmdir()
 
 
 @dataclass(frozen=True)
@@ -84,12 +121,25 @@ def recorded_run(output: Path) -> dict[str, Any] | None:
     if not config_file.is_file():
         return None
     try:
-        record = yaml.safe_load(config_file.read_text(encoding="utf-8"))
+        return read_record(config_file)
+    except DatasetError as error:
+        warnings.warn(f"{config_file}: {error.problem}, so the run starts from the beginning.")
+        return None
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """
+    :param file: the ``config.yml`` of a run
+    :return: its content
+    :raises DatasetError: if it is damaged
+    """
+    try:
+        record = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         record = " ".join(str(error).split())
-    if not isinstance(record, dict):
-        warnings.warn(f"{config_file}: is damaged ({str(record)[:200]}), so the run starts from the beginning.")
-        return None
+    if not isinstance(record, dict) or not {"algo", "env", "env_kwargs"} <= record.keys():
+        problem = f"is damaged ({str(record)[:200]})"
+        raise DatasetError(file, "file", problem, "Restore it from a copy, or train again")
     return record
 
 

@@ -22,9 +22,8 @@ from sb3_offline.envs import lacks_task
 from sb3_offline.experiment.data import DATA_ENTRIES, data_arguments
 from sb3_offline.experiment.evaluation import make_evaluation_env
 from sb3_offline.experiment.evaluation_table import EvaluationTable
-from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, TrainingRun
+from sb3_offline.experiment.run import CONFIG_FILE, MODEL_FILE, PENDING_FILE, RESUME_FILE, TrainingRun, locked_run, read_record
 
-RESUME_FILE = "resume.zip"
 # Beginning of the names of an earlier run's tables, while a new run replaces it.
 EARLIER = "earlier_"
 
@@ -226,7 +225,13 @@ def train_run(
         with the run
     :param verbose: 1 for info messages
     :return: the trained model
+    :raises RunInUseError: if another process trains in the folder
     """
+    with locked_run(run.output):
+        return _train_run(run, progress_bar, callbacks, verbose)
+
+
+def _train_run(run: TrainingRun, progress_bar: bool, callbacks: Sequence[BaseCallback], verbose: int) -> OfflineAlgorithm:
     record = run.record()
     config = {**run.config, "env_kwargs": record["env_kwargs"]}
     _check_counts({"n_timesteps": config["n_timesteps"], "n_eval_episodes": run.n_eval_episodes})
@@ -320,12 +325,7 @@ def load_run(model_path: Path, *, trust: bool = False) -> tuple[OfflineAlgorithm
     for file in (model_path, config_file):
         if not file.is_file():
             raise RuntimeError(f"{file}: there is no such file; give the model.zip in the folder of a training run")
-    try:
-        config = yaml.safe_load(config_file.read_text(encoding="utf-8"))
-        algo, *_ = config["algo"], config["env"], config["env_kwargs"]
-    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
-        problem = f"is not the record of a training run ({' '.join(str(error).split())})"
-        raise RuntimeError(f"{config_file}: {problem}; copy it again, or train again") from error
+    config = read_record(config_file)
     if not trust:
         check_model(model_path, "If you trust its origin, say so: --trust, or load_run(path, trust=True)")
-    return find_algorithm(algo).load(model_path), config
+    return find_algorithm(config["algo"]).load(model_path), config

@@ -60,19 +60,23 @@ class _Watched:
         return action, state
 
 
-def play_finals(results: Results, runs: Path) -> Iterator[tuple[str, str, PlayedEpisode]]:
+def play_finals(results: Results, runs: Path, *, trust: bool = False) -> Iterator[tuple[str, str, PlayedEpisode]]:
     """
     Play the first evaluation episode, unselected, of the last checkpoint and the first seed, for each method and task.
 
     :param results: results of a grid
     :param runs: folder of its runs
+    :param trust: open models that may run any code
     :return: method, task and episode, as far as the runs exist
     """
     for (method, task), entry in results.entries.items():
         seed = min(entry.by("seed"))
         model_file = cell_folder(runs, method, task, seed) / "model.zip"
         if model_file.is_file():
-            model, config = load_run(model_file)
+            model, config = load_run(model_file, trust=trust)
+            if ":" in str(config["env"]) and not trust:
+                remedy = "if you trust the origin of the runs, add --trust"
+                raise RuntimeError(f"{model_file}: its environment {config['env']!r} runs a module; {remedy}")
             env_kwargs = {**config["env_kwargs"], "task": task}
             yield method, task, play(model, config["env"], env_kwargs, evaluation_seed(seed, len(entry.by("step")) - 1))
 

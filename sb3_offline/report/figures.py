@@ -6,6 +6,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from sb3_offline.data.files import replacing
 from sb3_offline.report.episodes import PlayedEpisode
 from sb3_offline.report.results import Results
 
@@ -135,5 +136,6 @@ def plot_values(episodes: Mapping[tuple[str, str], PlayedEpisode], path: Path) -
 
 def _save(figure: plt.Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, format=path.suffix[1:])
     plt.close(figure)

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
+from sb3_offline.data.files import replacing
 from sb3_offline.report import figures
 from sb3_offline.report.aggregates import REPETITIONS, improvement_probabilities, interquartile_means
 from sb3_offline.report.episodes import PlayedEpisode, play_finals
@@ -11,7 +12,13 @@ from sb3_offline.report.results import FAILED, Results, comparison_table, read_r
 
 
 def write_report(
-    tables: Sequence[Path], output: Path, runs: Sequence[Path] = (), reference: str = "ceborl", notes: Path | None = None
+    tables: Sequence[Path],
+    output: Path,
+    runs: Sequence[Path] = (),
+    reference: str = "ceborl",
+    notes: Path | None = None,
+    *,
+    trust: bool = False,
 ) -> Iterator[str]:
     """
     Write ``report.md`` and its figures.
@@ -21,6 +28,7 @@ def write_report(
     :param runs: folder of the runs of each table, for film strips and values (default: leave these out)
     :param reference: the method that others are compared with
     :param notes: a Markdown file to begin with, about anything that numbers cannot show, such as the choice of hyperparameters
+    :param trust: open models of these runs that may run any code
     :return: messages for the user, as they arise
     """
     if runs and len(runs) != len(tables):
@@ -41,8 +49,9 @@ def write_report(
         figures.plot_curves(with_early_checkpoints(results, table), output / f"{results.name}_curves.png")
         if folder is not None:
             yield f"Playing the final policies in {folder}"
-            parts += _episodes(results, folder, output)
-    (output / "report.md").write_text("\n\n".join(parts) + "\n")
+            parts += _episodes(results, folder, output, trust)
+    with replacing(output / "report.md") as temporary:
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     yield f"Report: {output / 'report.md'}"
 
 
@@ -101,9 +110,9 @@ def _aggregates(results: Results, reference: str) -> str:
     return "\n".join([*lines, "", about])
 
 
-def _episodes(results: Results, runs: Path, output: Path) -> list[str]:
+def _episodes(results: Results, runs: Path, output: Path, trust: bool) -> list[str]:
     played: dict[tuple[str, str], PlayedEpisode] = {
-        (method, task): episode for method, task, episode in play_finals(results, runs)
+        (method, task): episode for method, task, episode in play_finals(results, runs, trust=trust)
     }
     if not played:
         raise RuntimeError(f"{runs}: holds no run of {results.name}; name the folder that was given to benchmark as --runs")

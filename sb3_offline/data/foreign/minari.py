@@ -22,11 +22,12 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.files import WriteLock
+from sb3_offline.data.files import WriteLock, open_hdf5
 from sb3_offline.data.foreign.base import Foreign, Format, Options, Scheme
 from sb3_offline.data.foreign.episodes import checked_observations
 from sb3_offline.data.foreign.probe import Probe
 from sb3_offline.data.format import Header
+from sb3_offline.data.plain import check_all_plain
 from sb3_offline.data.spaces import check_rows, space_to_json, subspaces
 
 PREFIX = "minari:"
@@ -99,6 +100,10 @@ def read(probe: Probe, options: Options) -> Foreign:
 
     path, folder = probe.path, _data_folder(probe) or probe.path
     probe.close()
+    if not probe.is_object:  # the library follows links and external storage in this file
+        for file in sorted(folder.glob("*.hdf5")):
+            with open_hdf5(file) as opened:
+                check_all_plain(opened, file)
     try:
         dataset = probe.given if probe.is_object else MinariDataset(folder)
         folder = Path(dataset.storage.data_path)
