@@ -206,7 +206,8 @@ def test_a_config_names_it_as_the_rl_zoo_does(both):
 
 
 CONFIG = """
-TestPointMass-v0: {policy: MlpPolicy, n_timesteps: 4, dataset: points.h5, batch_size: 8, policy_kwargs: {net_arch: [8]}, NAME: 3}
+TestPointMass-v0:
+  {policy: MlpPolicy, n_timesteps: 4, dataset: points.h5, batch_size: 8, policy_kwargs: {net_arch: [8]}, NAME: 3}
 """
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import h5py
@@ -22,6 +23,8 @@ REFERENCES = 200
 """Number of observations that measure the usual distance between episodes."""
 TOLERANCE = 1.5
 """An example is far from the data if its distance exceeds the largest usual distance by this factor."""
+FEW_EPISODES = 10
+"""Number of episodes from which examples show success in enough ways."""
 WARNED_SHARE = 0.02
 """Share of far examples that causes no warning, because not every episode of a large file is compared."""
 
@@ -81,10 +84,27 @@ def check_examples(
         problem += f"deviations; the data's own episodes differ by up to {usual.max():.3g})"
         remedy = "Check camera, crop, colours and units, or draw them from the same kind of data (sb3-offline examples)"
         warnings.append(DataWarning("examples", problem, remedy))
+    warnings += few_episodes(provenance)
     if provenance.get("held_out") and identical:
         problem = f"{identical} of {len(given)} are observations of this data, but are recorded as held out from it"
         warnings.append(DataWarning("examples", problem, "Draw them from other episodes, or without --held-out"))
     return summary, warnings
+
+
+def few_episodes(provenance: Mapping[str, Any]) -> list[DataWarning]:
+    """
+    :param provenance: of examples that :func:`~sb3_offline.data_tools.converting.extract_examples` drew; others say nothing of
+        their episodes
+    :return: a warning where many examples come from few episodes
+    """
+    n_episodes = sum(len(origin["episodes"]) for origin in provenance.get("datasets", []))
+    n_examples = provenance.get("n", 0)
+    if not 0 < n_episodes < min(FEW_EPISODES, n_examples):
+        return []
+    problem = (
+        f"{n_examples} come from {n_episodes} episode{'s' * (n_episodes > 1)}, and frames of one episode are nearly alike"
+    )
+    return [DataWarning("examples", f"{problem}: they teach hardly more than {n_episodes}", "Draw them from more episodes")]
 
 
 def _by_name(data: JoinedDatasets, observations: Observations) -> dict[str, np.ndarray]:
