@@ -93,7 +93,7 @@ def check_examples(
 
 def few_episodes(provenance: Mapping[str, Any]) -> list[DataWarning]:
     """
-    :param provenance: of examples that :func:`~sb3_offline.data_tools.converting.extract_examples` drew; others say nothing of
+    :param provenance: of examples that ``extract_examples`` drew; others say nothing of
         their episodes
     :return: a warning where many examples come from few episodes
     """
