@@ -167,6 +167,8 @@ def test_a_model_plays_and_is_judged_in_stacks_wherever_it_is(both, tmp_path):
             loaded.set_env(Replay())
         loaded.learn(1, reset_num_timesteps=False)
         assert all(th.equal(value, loaded.policy.state_dict()[name]) for name, value in model.policy.state_dict().items())
+    with pytest.raises(TypeError, match="n_stack is 0; give a whole number"):
+        IQL("MultiInputPolicy", Replay(), both, n_stack=0)
     with pytest.raises(TypeError, match="stacks 2 frames; give n_stack=2, not 3"):
         IQL("MultiInputPolicy", own, both, n_stack=3)
     with pytest.raises(TypeError, match=r"normalises single frames.*VecNormalize\(VecFrameStack\(env, 2\)\)"):

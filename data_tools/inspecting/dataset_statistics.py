@@ -10,6 +10,7 @@ from gymnasium import spaces
 from sb3_offline.data.reader import DatasetLike
 from sb3_offline.data_tools.inspecting.array_statistics import array_statistics
 from sb3_offline.data_tools.inspecting.dataset_warnings import find_warnings
+from sb3_offline.data_tools.inspecting.env_check import check_environment
 from sb3_offline.data_tools.inspecting.example_check import check_examples
 from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
 from sb3_offline.envs import ENV_ID
@@ -21,7 +22,7 @@ CELL_SIZE = 0.02
 
 
 def inspect_dataset(
-    source: DatasetLike | JoinedDatasets, examples: str | os.PathLike | np.ndarray | None = None
+    source: DatasetLike | JoinedDatasets, examples: str | os.PathLike | np.ndarray | None = None, env: Any = None
 ) -> dict[str, Any]:
     """
     Summarise one dataset file, or several files of one environment together. Images are sampled; all other arrays are read
@@ -29,6 +30,7 @@ def inspect_dataset(
 
     :param source: path, glob pattern, ``OfflineDataset``, or a sequence of these
     :param examples: success examples to compare with the data, in any form that learners take
+    :param env: an environment to compare the spaces with
     :return: JSON types: numbers, texts, lists and dicts. ``warnings`` lists likely mistakes, each with a ``field``, a
         ``problem`` and a ``remedy``.
     """
@@ -62,6 +64,8 @@ def inspect_dataset(
     if examples is not None:
         summary["examples"], more = check_examples(data, examples)
         warnings += more
+    if env is not None:
+        warnings += check_environment(data, env)
     summary["warnings"] = [warning._asdict() for warning in warnings]
     return summary
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import h5py
@@ -11,6 +12,9 @@ from sb3_offline.data.example_gap import example_gap
 from sb3_offline.data.examples import load_examples
 from sb3_offline.data_tools.inspecting.dataset_warnings import DataWarning
 from sb3_offline.data_tools.inspecting.joined_datasets import JoinedDatasets
+
+FEW_EPISODES = 10
+"""Number of episodes from which examples show success in enough ways."""
 
 
 def check_examples(
@@ -42,12 +46,29 @@ def check_examples(
     warnings = []
     if found := gap.problem():
         warnings.append(DataWarning("examples", *found))
+    warnings += few_episodes(provenance)
     if provenance.get("held_out") and gap.identical:
         problem = (
             f"{gap.identical} of {len(gap.distances)} are observations of this data, but are recorded as held out from it"
         )
         warnings.append(DataWarning("examples", problem, "Draw them from other episodes, or without --held-out"))
     return summary, warnings
+
+
+def few_episodes(provenance: Mapping[str, Any]) -> list[DataWarning]:
+    """
+    :param provenance: of examples that ``extract_examples`` drew; others say nothing of
+        their episodes
+    :return: a warning where many examples come from few episodes
+    """
+    n_episodes = sum(len(origin["episodes"]) for origin in provenance.get("datasets", []))
+    n_examples = provenance.get("n", 0)
+    if not 0 < n_episodes < min(FEW_EPISODES, n_examples):
+        return []
+    problem = (
+        f"{n_examples} come from {n_episodes} episode{'s' * (n_episodes > 1)}, and frames of one episode are nearly alike"
+    )
+    return [DataWarning("examples", f"{problem}: they teach hardly more than {n_episodes}", "Draw them from more episodes")]
 
 
 def _provenance(examples: Any) -> dict[str, Any]:

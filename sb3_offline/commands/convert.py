@@ -1,9 +1,12 @@
 """The command ``sb3-offline convert``."""
 
 import argparse
+import sys
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
 
 from sb3_offline.data.convert import convert
 from sb3_offline.data.reader import OfflineDataset
@@ -23,8 +26,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env", help="id of the environment, for the spaces and the time limit that the source does not declare"
     )
+    for name, bound in (("low", "lower"), ("high", "upper")):
+        parser.add_argument(
+            f"--action-{name}",
+            type=float,
+            nargs="+",
+            metavar="BOUND",
+            help=f"{bound} bounds of the actions' entries, where the source declares none",
+        )
     parser.add_argument("--overwrite", action="store_true", help="replace the destination if it is a file")
     parser.add_argument("--trust", action="store_true", help="open files that may run any code, such as pickles of others")
+
+
+def _action_space(args: argparse.Namespace) -> spaces.Box:
+    low, high = args.action_low or [], args.action_high or []
+    if len(low) != len(high) or not np.less(low, high).all():
+        problem = f"--action-low has {len(low)} numbers, and --action-high {len(high)}"
+        sys.exit(f"sb3-offline: {problem}; give both, a lower and a higher number for each entry of an action")
+    return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
 
 def run(args: argparse.Namespace) -> None:
@@ -35,6 +54,8 @@ def run(args: argparse.Namespace) -> None:
         declared = {"observation_space": env.observation_space, "action_space": env.action_space}
         declared["max_episode_steps"] = env.spec.max_episode_steps if env.spec else None
         env.close()
+    if args.action_low or args.action_high:
+        declared["action_space"] = _action_space(args)
     dataset = OfflineDataset(args.source, **declared, trust=args.trust)
     dataset.header.env_id = dataset.header.env_id or args.env or ""
     convert(dataset, args.destination, args.storage, overwrite=args.overwrite)

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import sys
 
 from sb3_offline.data.errors import DatasetError
 from sb3_offline.data.examples import save_examples
@@ -9,6 +10,7 @@ from sb3_offline.data.files import check_outputs
 from sb3_offline.data.reader import open_datasets
 from sb3_offline.data.spaces import subspace
 from sb3_offline.data_tools.converting.extract_examples import extract_examples
+from sb3_offline.data_tools.inspecting.example_check import few_episodes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,3 +40,5 @@ def run(args: argparse.Namespace) -> None:
     save_examples(args.output, examples, space, provenance, overwrite=args.overwrite)
     n_episodes = sum(len(origin["episodes"]) for origin in provenance["datasets"])
     print(f"{args.count} examples from {n_episodes} episodes -> {args.output}")
+    for warning in few_episodes(provenance):
+        print(f"Warning: {warning.field}: {warning.problem}. {warning.remedy}.", file=sys.stderr)

@@ -82,6 +82,7 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
             try:
                 found = self.load_examples(self.examples)  # of the keys that they hold
                 given = list(found) if isinstance(found, dict) else None
+                self._read_examples = self.examples, found
             except DatasetError:  # is raised again when the model learns: until then, it needs no examples
                 pass
         return [key for key in space.spaces if given is None or key in given]
@@ -179,4 +180,6 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [*super()._excluded_save_params(), "_read_examples", "_batch_arrays"]
-        return excluded if isinstance(self.examples, (str, PathLike)) else [*excluded, "examples"]
+        parts = self.examples.values() if isinstance(self.examples, Mapping) else [self.examples]
+        only_paths = all(isinstance(part, (str, PathLike)) for part in parts)
+        return excluded if only_paths else [*excluded, "examples"]

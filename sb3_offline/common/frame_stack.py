@@ -11,6 +11,8 @@ from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
+from sb3_offline.data.stacking import check_n_stack
+
 
 def stacked_env(env: GymEnv | str, n_stack: int) -> GymEnv | str:
     """
@@ -20,6 +22,7 @@ def stacked_env(env: GymEnv | str, n_stack: int) -> GymEnv | str:
         ``TypeError`` if it stacks another number of frames, or if a ``VecNormalize`` normalises single frames: that must be
         around the stacks
     """
+    check_n_stack(n_stack)
     if n_stack == 1:
         return env
     made: Any = maybe_make_env(env, 0)

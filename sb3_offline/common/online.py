@@ -38,7 +38,8 @@ def export_sac(
 
     Critics that learned from rewards are kept. Critics that learned from examples do not estimate rewards, so SAC gets new
     ones on the same encoder; where that sees the keys of the examples only, on a copy of the policy's. A deterministic actor
-    gets a standard deviation of 0.1 before the tanh.
+    gets a standard deviation of 0.1 before the tanh. A model with ``n_stack`` becomes a SAC that sees stacks, to be loaded
+    with an environment in a ``VecFrameStack``.
 
     :param model: trained actor-critic. If it learned with a ``VecNormalize``, that must be its environment, and SAC must be
         loaded with it too

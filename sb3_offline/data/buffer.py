@@ -127,13 +127,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.n_steps, self.gamma, self.next_actions = n_steps, gamma, next_actions
         self.datasets, self.n_stack = datasets, n_stack
         self._frame_space = frame_space(observation_space, n_stack)
-        self._transposed = _match_observations(datasets[0], self._frame_space)
-        if not same_actions(datasets[0].action_space, action_space):
-            problem = f"is {datasets[0].action_space}, but the learner has {action_space}"
-            remedy = "Use the environment that the data were collected in"
-            if datasets[0].guessed_actions:
-                remedy = "The file declares no bounds: give OfflineDataset(path, action_space=...)"
-            raise DatasetError(datasets[0].path, "action_space", problem, remedy)
+        self._transposed = check_learner_spaces(datasets[0], self._frame_space, action_space)
         self._index_steps(self.lengths)
         self.actions = self._scaled_actions()
         self.rewards = self._file_rewards = self._concatenate("rewards", np.zeros(n_steps_total, np.float32))
@@ -460,6 +454,26 @@ def joined(batches: Sequence[Observations]) -> Observations:
 def _plain_shape(space: spaces.Space) -> tuple[int, ...]:
     """:return: SB3's shape of one observation of a plain space: (1,) for Discrete"""
     return get_obs_shape(space)  # type: ignore[return-value]
+
+
+def check_learner_spaces(
+    dataset: OfflineDataset, observation_space: spaces.Space | None = None, action_space: spaces.Space | None = None
+) -> set[str]:
+    """
+    :param dataset: an open dataset
+    :param observation_space: the learner's space of single frames; ``None`` is not checked
+    :param action_space: the learner's space; ``None`` is not checked
+    :return: names of the arrays of images that are channel-last in the files and channel-first for the learner; raises
+        ``DatasetError`` if the data do not fit the learner
+    """
+    transposed = set() if observation_space is None else _match_observations(dataset, observation_space)
+    if action_space is not None and not same_actions(dataset.action_space, action_space):
+        problem = f"is {dataset.action_space}, but the learner has {action_space}"
+        remedy = "Use the environment that the data were collected in"
+        if dataset.guessed_actions:
+            remedy = "The file declares no bounds: give OfflineDataset(path, action_space=...)"
+        raise DatasetError(dataset.path, "action_space", problem, remedy)
+    return transposed
 
 
 def _match_observations(dataset: OfflineDataset, space: spaces.Space) -> set[str]:

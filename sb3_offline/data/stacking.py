@@ -17,8 +17,7 @@ def stacked_space(space: spaces.Space, n_stack: int) -> spaces.Space:
     :return: space of their stack; the space itself for one frame. Raises ``TypeError`` if ``n_stack`` is no count, and
         ``DatasetError`` if the space is of another kind
     """
-    if not isinstance(n_stack, int | np.integer) or isinstance(n_stack, bool) or n_stack < 1:
-        raise TypeError(f"n_stack is {n_stack!r}; give a whole number of at least 1")
+    check_n_stack(n_stack)
     if n_stack == 1:
         return space
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
@@ -28,6 +27,12 @@ def stacked_space(space: spaces.Space, n_stack: int) -> spaces.Space:
             raise DatasetError("", "observation_space", problem, "Leave out n_stack, or wrap the environment")
     stacked = {key: StackedObservations(1, n_stack, part).stacked_observation_space for key, part in parts.items()}  # type: ignore
     return spaces.Dict(OrderedDict(stacked)) if isinstance(space, spaces.Dict) else stacked[""]
+
+
+def check_n_stack(n_stack: int) -> None:
+    """:param n_stack: number of frames in a stack; raises ``TypeError`` if it is no count"""
+    if not isinstance(n_stack, int | np.integer) or isinstance(n_stack, bool) or n_stack < 1:
+        raise TypeError(f"n_stack is {n_stack!r}; give a whole number of at least 1")
 
 
 def frame_space(space: spaces.Space, n_stack: int) -> spaces.Space:

@@ -1,6 +1,5 @@
 """A callback that evaluates a model on held-out data."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,9 +79,11 @@ class OfflineEvalCallback(BaseCallback):
         self.indices = np.sort(np.random.default_rng(0).choice(size, size=n, replace=False))
         self.example_observations: PyTorchObs | None = None
         if self.examples is not None:
-            knows_examples = isinstance(model, ExampleBasedAlgorithm)  # their keys, and how many frames it stacks
-            read = model.load_examples if knows_examples else partial(load_examples, observation_space=model.observation_space)
-            arrays: Any = read(self.examples)
+            arrays: Any
+            if isinstance(model, ExampleBasedAlgorithm):  # it knows their keys, and how many frames it stacks
+                arrays = model.load_examples(self.examples)
+            else:
+                arrays = load_examples(self.examples, model.observation_space)
             if model._vec_normalize_env is not None:
                 arrays = normalize_parts(model._vec_normalize_env, arrays)
             if isinstance(arrays, dict):

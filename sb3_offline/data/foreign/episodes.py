@@ -129,7 +129,9 @@ def guess_action_space(
     :return: a Box of their shape with the bounds [-1, 1]
     :raises DatasetError: if the actions are integers, or if they exceed these bounds
     """
-    remedy = "Open it with OfflineDataset(path, action_space=...), or convert it with --env ID"
+    remedy = (
+        "Open it with OfflineDataset(path, action_space=...), or convert it with --env ID or --action-low and --action-high"
+    )
     data = f"data of {format_name}" if format_name else "data of this format"
     if actions.dtype.kind != "f":
         problem = f"has dtype {actions.dtype}, and {data} do not declare which actions there are"
