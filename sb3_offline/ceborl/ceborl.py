@@ -206,7 +206,7 @@ class CEBORL(RecursiveClassifier):
             self._setup_model()
 
     def _make_parts(self) -> tuple[Backup, PolicyExtraction]:
-        return BACKUPS[self.backup](self), EXTRACTIONS[self.policy_extraction](self)
+        return BACKUPS[self.backup](self), EXTRACTIONS[self.policy_extraction](self)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
         if self.random_shift is None and hasattr(self, "observation_space"):

@@ -164,7 +164,7 @@ def data_checksum(datasets: Sequence[OfflineDataset]) -> int:
     """
     checksum = 0
     for part in datasets:
-        checksum = zlib.crc32(np.ascontiguousarray(part.actions).data, zlib.crc32(part.lengths.astype("<i8"), checksum))
+        checksum = zlib.crc32(np.ascontiguousarray(part.actions).data, zlib.crc32(part.lengths.astype("<i8").data, checksum))
     return checksum
 
 
