@@ -275,6 +275,8 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
                     raise
         # This process has the file open with the lock, and HDF5 requires the same setting each time.
         return h5py.File(path, "r", locking=True)
+    except FileNotFoundError as error:  # removed in this moment
+        raise DatasetError(path, "file", "does not exist", "Check the path") from error
     except OSError as error:
         if "truncated file" in str(error):
             raise DatasetError(path, "file", "is truncated", "Copy or download it again: its end is missing") from error
@@ -287,8 +289,11 @@ def _check_heaps(path: str | os.PathLike) -> None:
     Refuse a file that HDF5 would read for ever: it takes the objects of a heap, in which texts are, one after the other, and
     does not advance where a free one has no size. A block of zeros, which a disk left, looks like that.
     """
-    with open(path, "rb") as file:
-        head = file.read(_HEAD_BYTES)  # texts are written first; a heap behind this is not checked
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)  # texts are written first; a heap behind this is not checked
+    except OSError:  # HDF5 says what is wrong
+        return
     start = head.find(b"GCOL\x01")
     while start >= 0:
         end = min(start + int.from_bytes(head[start + 8 : start + 16], "little"), len(head))
