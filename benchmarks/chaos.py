@@ -163,7 +163,8 @@ def convert_it(place: Callable[[], Path], stop: Any) -> None:
     """Convert a file in its place, again and again."""
     while not stop.value:
         try:
-            convert(place(), place(), overwrite=True, progress_bar=False)
+            path = place()
+            convert(path, path, overwrite=True, progress_bar=False)
         except DatasetError:
             pass
         time.sleep(0.001)

@@ -147,6 +147,15 @@ def test_examples_have_a_checksum(tmp_path):
         load_examples(tmp_path / "e.h5", STATES)
 
 
+def test_a_file_that_hdf5_would_read_for_ever_is_refused(path):
+    raw = bytearray(path.read_bytes())
+    heap = raw.find(b"GCOL\x01")
+    assert heap > 0
+    raw[heap + 16 : heap + 1000] = bytes(984)  # a block of zeros
+    path.write_bytes(raw)
+    assert "damaged heap of texts" in check_dataset(path).damages[0]
+
+
 # --- The command ---
 
 

@@ -1,5 +1,6 @@
 """The documents say what the files and the registry say."""
 
+import re
 import runpy
 import subprocess
 import sys
@@ -63,3 +64,15 @@ def test_repository_stays_small():
         pytest.skip("not a git checkout")
     files = [ROOT / name for name in listed.decode().split("\0") if name]
     assert sum(file.stat().st_size for file in files if file.is_file()) < MAX_BYTES
+
+
+def test_promises_name_tests_that_exist():
+    words = re.findall(r"`(test_\w+\.py|test_\w+(?:\.\.\.)?)`", (ROOT / "docs/promises.md").read_text())
+    source, n_tests = "", 0
+    for word in words:
+        if word.endswith(".py"):
+            source = (ROOT / "tests" / word).read_text()
+        else:
+            n_tests += 1
+            assert f"def {word.removesuffix('...')}" in source, word
+    assert n_tests > 20

@@ -73,6 +73,26 @@ def test_a_writer_is_not_disturbed_by_processes_that_ask_for_its_file(tmp_path):
     assert os.listdir(tmp_path) == ["d.h5"]
 
 
+def test_a_conversion_in_place_loses_no_episode_that_came_meanwhile(tmp_path, monkeypatch):
+    path = tmp_path / "d.h5"
+    write_dataset(path, 2)
+    opened = OfflineDataset(path)
+    lock = WriteLock
+
+    def late_lock(*args, **kwargs):  # another writer is faster
+        monkeypatch.setattr("sb3_offline.data.convert.WriteLock", lock)
+        with DatasetWriter(path, IMAGES, ACTIONS, **OPTIONS, mode="a") as writer:
+            writer.add_episode(**make_episode(writer.n_episodes))
+        return lock(*args, **kwargs)
+
+    monkeypatch.setattr("sb3_offline.data.convert.WriteLock", late_lock)
+    convert(path, path, overwrite=True, progress_bar=False)
+    assert OfflineDataset(path).n_episodes == 3
+    with pytest.raises(DatasetError, match="was written to by another process after it was opened"):
+        convert(opened, path, overwrite=True, progress_bar=False)
+    assert OfflineDataset(path).n_episodes == 3
+
+
 def test_leftovers_of_killed_writers_are_removed_and_permissions_stay(tmp_path):
     path = tmp_path / "d.h5"
     for name in (".d.h5.tmp", ".d.h5.17.0123abcd.tmp", "..d.h5.17.0123abcd.tmp.lock", ".d.h5.lock"):

@@ -45,12 +45,19 @@ def convert(
         write_foreign(foreign, opened.header, opened.arrays, os.fspath(destination))
         return
     path = Path(destination).expanduser()
-    fields = opened.header.fields()
-    total = sum(spec.rows(opened.n_episodes, opened.n_steps) * spec.row_bytes for spec in fields.values())
     # Other writers of the destination are refused at once instead of doing all the work for nothing
     with WriteLock(path) as lock, contextlib.ExitStack() as stack:
         if path.exists() and not overwrite:
             raise DatasetError(path, "file", "exists already", "Give another name, or overwrite it (--overwrite)")
+        if opened.storage != "memory" and path.exists() and os.path.samefile(path, opened.path):
+            # A writer may have added episodes before this process got the lock; a copy without them would lose them
+            latest = OfflineDataset(opened.path)
+            if isinstance(dataset, OfflineDataset) and not _same_episodes(opened, latest):
+                remedy = "Convert it again"
+                raise DatasetError(path, "file", "was written to by another process after it was opened", remedy)
+            opened = opened if isinstance(dataset, OfflineDataset) else latest
+        fields = opened.header.fields()
+        total = sum(spec.rows(opened.n_episodes, opened.n_steps) * spec.row_bytes for spec in fields.values())
         if opened.storage == "memory":
             check_outputs([path], [opened.path])
         temporary = stack.enter_context(replacing(path, lock))
@@ -76,3 +83,9 @@ def convert(
                     raise damage(opened.path, name, np.flatnonzero(wrong).tolist())
             if opened.n_episodes:
                 file[CHECKSUMS][:] = checksums
+
+
+def _same_episodes(one: OfflineDataset, other: OfflineDataset) -> bool:
+    if (one.checksums is None) != (other.checksums is None) or not np.array_equal(one.lengths, other.lengths):
+        return False
+    return one.checksums is None or other.checksums is None or np.array_equal(one.checksums.values, other.checksums.values)

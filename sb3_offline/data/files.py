@@ -17,6 +17,8 @@ import h5py
 
 from sb3_offline.data.errors import DatasetError
 
+_HEAD_BYTES = 1 << 16
+
 
 class WriteLock:
     """
@@ -263,6 +265,7 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
     """
     if not os.path.isfile(path):
         raise DatasetError(path, "file", "does not exist", "Check the path")
+    _check_heaps(path)
     try:
         for locking in (False, None):
             try:
@@ -272,8 +275,35 @@ def open_hdf5(path: str | os.PathLike) -> h5py.File:
                     raise
         # This process has the file open with the lock, and HDF5 requires the same setting each time.
         return h5py.File(path, "r", locking=True)
+    except FileNotFoundError as error:  # removed in this moment
+        raise DatasetError(path, "file", "does not exist", "Check the path") from error
     except OSError as error:
         if "truncated file" in str(error):
             raise DatasetError(path, "file", "is truncated", "Copy or download it again: its end is missing") from error
         problem = "cannot be read as HDF5 (" + str(error).strip() + ")"
         raise DatasetError(path, "file", problem, "Check that this is a complete .h5 or .hdf5 file") from error
+
+
+def _check_heaps(path: str | os.PathLike) -> None:
+    """
+    Refuse a file that HDF5 would read for ever: it takes the objects of a heap, in which texts are, one after the other, and
+    does not advance where a free one has no size. A block of zeros, which a disk left, looks like that.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)  # texts are written first; a heap behind this is not checked
+    except OSError:  # HDF5 says what is wrong
+        return
+    start = head.find(b"GCOL\x01")
+    while start >= 0:
+        end = min(start + int.from_bytes(head[start + 8 : start + 16], "little"), len(head))
+        place = start + 16
+        while place + 16 <= end:
+            size = int.from_bytes(head[place + 8 : place + 16], "little")
+            if head[place : place + 2] != b"\0\0":
+                size = 16 + -(-size // 8) * 8
+            if size == 0:
+                problem = f"holds a damaged heap of texts (at byte {place})"
+                raise DatasetError(path, "file", problem, "Restore the file from a copy, or download it again")
+            place += size
+        start = head.find(b"GCOL\x01", start + 8)
