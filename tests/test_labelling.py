@@ -247,7 +247,7 @@ def test_images_are_labelled_and_shown(keys, tmp_path, capsys):
     if keys:
         examples["clock"] = np.random.default_rng(1).random((12, 1), np.float32)
     np.savez(tmp_path / "examples.npz", **examples)
-    arguments = ["--examples", str(tmp_path / "examples.npz"), "--steps", "40", "--html", str(tmp_path / "page.html")]
+    arguments = ["--examples", str(tmp_path / "examples.npz"), "--steps", "25", "--html", str(tmp_path / "page.html")]
     arguments += ["-o", str(tmp_path / "labels.h5"), "--copy", str(tmp_path / "copy.h5"), "--check"]
     main(["label", str(tmp_path / "lights.h5"), *arguments, "--device", "cpu"])
     labels = load_labels(tmp_path / "labels.h5")
