@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from sb3_offline import ALGOS, cli
+from sb3_offline.benchmark.grid import load_grid
 from sb3_offline.commands import COMMANDS
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.reader import OfflineDataset
@@ -163,6 +164,15 @@ def test_shipped_configs_are_read_and_overwritten():
         "mu": "policy",
         "policy_kwargs": {"net_arch": [8]},
     }
+
+
+@pytest.mark.parametrize(("name", "policy"), [("ceborl", "MlpPolicy"), ("ceborl_pixels", "CnnPolicy")])
+def test_the_constructors_defaults_are_the_published_settings(name, policy):
+    """Four lines of Python give the row of the table: a config says which policy, how long, and where the data are."""
+    config = load_config(name, "MultimodalMetaworld-v0")
+    assert config.keys() == {"policy", "n_timesteps", "dataset", "examples", "env_kwargs"} and config["policy"] == policy
+    for grid in ("second_table_states", "second_table_pixels", "table1_states"):
+        assert not load_grid(grid).methods["ceborl"].changes
 
 
 def test_paper_preset_and_paper_config_are_the_same():
