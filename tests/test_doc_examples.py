@@ -20,7 +20,7 @@ pytest.importorskip("metaworld")
 import sb3_offline.evaluation
 import sb3_offline.experiment.evaluation
 from sb3_offline import ORIL, OfflineAlgorithm
-from sb3_offline.ceborl import DiagnosticsCallback
+from sb3_offline.ceborl import DiagnosticsCallback, backups
 from sb3_offline.cli import main
 from sb3_offline.common.example_based import ExampleBasedAlgorithm
 from sb3_offline.data.convert import convert
@@ -160,6 +160,7 @@ def test_python_blocks_run(page, stand_ins, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for owner, name, divisors in BUDGETS:
         monkeypatch.setattr(owner, name, divide(getattr(owner, name), divisors))
+    monkeypatch.setattr(backups, "DETECTOR_PASSES", 0)
     namespace = {"__name__": "__main__"}  # as in a script: functions that it defines are saved with a model, by value
     exec(PRELUDES.get(page, ""), namespace)
     for block in BLOCKS[page]:
