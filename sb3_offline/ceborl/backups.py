@@ -224,7 +224,7 @@ class EpisodeBackup(Backup):
         return actions.new_full((len(actions),), self.model.gamma)
 
     def success_odds(self, example_logits: th.Tensor) -> th.Tensor:
-        return example_logits.new_tensor(self.model.gamma)
+        return example_logits.new_full((), self.model.gamma)
 
     def state_loss(
         self, observations: PyTorchObs, features: th.Tensor, actions: th.Tensor, discounted_omega: th.Tensor

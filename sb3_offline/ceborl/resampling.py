@@ -54,7 +54,8 @@ class WeightedTransitions:
 
     def effective_share(self) -> th.Tensor:
         """:return: scalar, the share of the weighted transitions that would carry as much if all weights were equal"""
-        return effective_share(self.weights[self.weights > 0])
+        n_weighted = (self.weights > 0).sum().clamp(min=1)  # a mask would make a GPU wait
+        return effective_share(self.weights) * len(self.weights) / n_weighted
 
     def __getstate__(self) -> dict[str, Any]:
         return {"weights": self.weights.cpu()}  # a saved model also loads where its device is missing
