@@ -23,7 +23,7 @@ from sb3_offline.labelling.classifier import StepProbabilities
 STATES = spaces.Box(-5, 5, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 EXAMPLES = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
-GAMMA, SMALL = 0.9, {"net_arch": [16, 16], "mixed_precision": False}
+GAMMA, SMALL = 0.9, {"net_arch": [16, 16], "mixed_precision": False, "actor_dropout": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,8 @@ def test_in_sample_form(dataset, monkeypatch, advantage):
 def test_episode_form(dataset, monkeypatch):
     """The default: omega is the best discounted detection in the rest of the episode, and nothing is bootstrapped."""
     beta, temperature, lengths = 0.2, 0.5, OfflineDataset(dataset / "states.h5").lengths
-    detected = StepProbabilities(np.random.default_rng(1).random(lengths.sum() + len(lengths)), lengths, Calibration(1, 0, 0))
+    rows = np.random.default_rng(1).random(lengths.sum() + len(lengths))
+    detected = StepProbabilities(rows, lengths, Calibration(1, 0, 0), rows, rows)
     monkeypatch.setattr(backups, "success_probabilities", lambda *_, **__: detected)
     kwargs = {"gamma": GAMMA, "beta": beta, "temperature": temperature, "n_action_samples": 5, "example_share": 0.0}
     model = CEBORL("MlpPolicy", None, dataset / "states.h5", EXAMPLES, seed=0, policy_kwargs=SMALL, **kwargs)
