@@ -62,7 +62,7 @@ def test_fitted_q_evaluation_gives_the_exact_value(tmp_path, goes_right, exact):
 
 
 def test_what_followed_an_episodes_last_step_counts(files):  # noqa: F811
-    model = make("ceborl", "MlpPolicy", files)
+    model = make("ceborl", "MlpPolicy", files, backup="dataset")
     own, callback = model.replay_buffer, OfflineEvalCallback()
     callback.init_callback(model)
     callback._on_training_start()
@@ -70,7 +70,7 @@ def test_what_followed_an_episodes_last_step_counts(files):  # noqa: F811
     last = np.cumsum(own.datasets[0].lengths) - 1
     following = callback.buffer.transitions(last).next_observations
     assert th.equal(following, plain.transitions(last).next_observations)
-    assert th.equal(own.transitions(last).next_observations, own.transitions(last).observations)  # CEBORL's own convention
+    assert th.equal(own.transitions(last).next_observations, own.transitions(last).observations)  # the convention of this backup
 
 
 def test_a_run_is_the_same_with_and_without_and_logs_what_applies(files, tmp_path):  # noqa: F811
