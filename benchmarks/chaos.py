@@ -154,7 +154,7 @@ def ask(place: Callable[[], Path], stop: Any) -> None:
     while not stop.value:
         try:
             writer(place()).close()
-        except DatasetError:
+        except (DatasetError, FileNotFoundError):  # the second, where a round ends meanwhile and removes its file
             pass
         time.sleep(0.001)  # leaves the writer a part of the processor
 
@@ -177,7 +177,9 @@ def read_it(place: Callable[[], Path], stop: Any, wrong: Any) -> None:
             seeds = OfflineDataset(place()).seeds
             wrong.value += not np.array_equal(seeds, np.arange(len(seeds)))
         except DatasetError as error:
-            wrong.value += "does not exist" not in str(error) and "was replaced" not in str(error)
+            if "does not exist" not in str(error) and "was replaced" not in str(error):
+                print(f"WRONG: {error}", flush=True)
+                wrong.value += 1
         time.sleep(0.001)
 
 

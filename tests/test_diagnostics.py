@@ -53,9 +53,10 @@ def test_values_that_run_away_are_told_once_each_with_a_remedy(dataset):
 
 
 def test_a_domain_gap_is_told(dataset):
-    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50), goal_examples() + np.float32(1.0))
+    far = goal_examples() + np.float32(1.0)
+    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50), far, backup="dataset")
     assert len(messages) == 1 and "tells all examples from each of 1024 states" in messages[0]
-    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50, early_steps=40), goal_examples() + np.float32(1.0))
+    _, messages = learn(dataset, 50, DiagnosticsCallback(check_freq=50, early_steps=40), far, backup="dataset")
     assert messages == []  # late, it may know them by heart
 
 

@@ -70,7 +70,9 @@ def test_what_followed_an_episodes_last_step_counts(files):  # noqa: F811
     last = np.cumsum(own.datasets[0].lengths) - 1
     following = callback.buffer.transitions(last).next_observations
     assert th.equal(following, plain.transitions(last).next_observations)
-    assert th.equal(own.transitions(last).next_observations, own.transitions(last).observations)  # the convention of this backup
+    assert th.equal(
+        own.transitions(last).next_observations, own.transitions(last).observations
+    )  # the convention of this backup
 
 
 def test_a_run_is_the_same_with_and_without_and_logs_what_applies(files, tmp_path):  # noqa: F811
