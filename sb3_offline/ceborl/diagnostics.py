@@ -132,7 +132,8 @@ class DiagnosticsCallback(BaseCallback):
             "omega_clipped": found["omega_clipped"] > CLIPPED_SHARE,
             "actions_on_bounds": found["actions_on_bounds"] > COLLAPSED_SHARE and more > COLLAPSED_SHARE / 2,
             "domain_gap": found["data_like_examples"] == 0 and self.num_timesteps <= self.early_steps,
-            "weights_collapsed": effective_transitions < EFFECTIVE_TRANSITIONS,
+            # Before that, few transitions have a weight at all
+            "weights_collapsed": effective_transitions < EFFECTIVE_TRANSITIONS <= n_kept / 10,
         }
         about = {
             **found,
