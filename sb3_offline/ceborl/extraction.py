@@ -144,6 +144,8 @@ class WeightedRegression(PolicyExtraction):
         self.checksum: int | None = None  # of the dataset that the weights belong to
 
     def policy_kwargs(self) -> dict[str, Any]:
+        if hasattr(self.model, "policy_batches"):  # an earlier version saved the model
+            return {"std_min": 0.05}
         # The policy imitates few transitions, which it would learn by heart. It has an encoder of its own for images, because
         # features that tell success apart need not tell which action is good
         own_encoder = has_images(self.model.observation_space)
