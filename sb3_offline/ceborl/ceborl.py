@@ -62,10 +62,10 @@ class CEBORL(RecursiveClassifier):
              + (1 - gamma) E_{s ~ S*, a ~ pi}[CE(C(s, a); y = 1)]                                (b)
              + E_D[(1 + gamma omega) CE(C(s, a); y = gamma omega / (1 + gamma omega))]           (c)
 
-    with ``omega = C(s', a') / (1 - C(s', a'))`` (Eq. 3). The defaults differ from the paper's exact form, which did not learn
-    in our trials (see the docs): ``a'`` is the dataset's next action instead of the policy's, over ``n_steps``, and the policy
-    imitates the dataset's actions, weighted by their advantage, instead of maximising C. The paper's form is
-    :data:`PAPER_FORM`: ``CEBORL("CnnPolicy", env, ..., **PAPER_FORM)``.
+    with ``omega = C(s', a') / (1 - C(s', a'))`` (Eq. 3). The defaults differ from the paper's form in two ways. Omega is the
+    discounted success in the rest of the dataset's own episode, which a classifier of states detects, so nothing is
+    bootstrapped. The policy imitates the dataset's actions, weighted by their advantage, instead of maximising C. The paper's
+    form is :data:`PAPER_FORM`: ``CEBORL("CnnPolicy", env, ..., **PAPER_FORM)``.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: The environment the policy is meant for, a registered id, or ``None`` (spaces from the dataset)
@@ -76,8 +76,8 @@ class CEBORL(RecursiveClassifier):
     :param example_batch_size: Success examples in a batch
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor. It also decides how fast the odds of states fade that the classifier mistakes for
-        success: where episodes are short (50 steps in the shipped environment), try 0.95
-    :param n_steps: omega is the mean of the discounted 1-step and n-step odds (1: the 1-step odds alone)
+        success
+    :param n_steps: the longer of the two horizons of omega (1: one step alone), for any ``backup`` but ``"episode"``
     :param beta: weight of the conservative penalty (a); with 0 the next three have no effect
     :param n_action_samples: K, the number of actions drawn from mu at each state
     :param mu: distribution of the penalised actions: ``"uniform"``, ``"policy"``, or ``"mixture"`` (half of each)
@@ -87,13 +87,13 @@ class CEBORL(RecursiveClassifier):
         "relative" density ratio)
     :param initial_odds: odds of the untrained classifier. A network's usual first output, 0, means odds of 1, far above the
         truth. Discounting takes thousands of steps to bring them down, and until then they look like success
-    :param backup: next action a' of omega: ``"dataset"``, the dataset's next action; ``"policy"``, the policy's, as in the
-        paper; or ``"expectile"``, no action: a state's odds are an upper expectile of the logits of the dataset's actions in
-        it, as in IQL
+    :param backup: where omega comes from: ``"episode"``, the rest of the episode; or the target network, at the dataset's next
+        action (``"dataset"``), at the policy's, as in the paper (``"policy"``), or at none (``"expectile"``: a state's odds
+        are an upper expectile of the logits of the dataset's actions in it, as in IQL)
     :param policy_extraction: ``"weighted"``: imitate the dataset's actions, weighted by their advantage; ``"maximize"``: the
-        paper's Eq. 11. The next six belong to ``"weighted"``
+        paper's Eq. 11. The next three belong to ``"weighted"``
     :param advantage: the outcome that the weights compare with the state's odds: ``"return"``: omega, to which the dataset's
-        actions led within the n-step window; ``"value"``: the classifier's odds of the dataset's action
+        action led; ``"value"``: the classifier's odds of this action; ``"mean"``: the geometric mean of both
     :param temperature: temperature of the advantage weights, which are the ratio of the odds to the power 1 / temperature
     :param state_exponent: power by which states and outcomes far from success count less. An advantage says which action is
         better in a state, but most states of a mixed dataset lead nowhere, and their best action matters little
