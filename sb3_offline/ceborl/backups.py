@@ -194,12 +194,12 @@ class EpisodeBackup(Backup):
     def __init__(self, model: Learner):
         super().__init__(model)
         self.outcomes: th.Tensor | None = None  # (transitions,), gamma * omega
-        self.made_of: tuple[int, ...] = ()  # identifies the data and the examples that the outcomes belong to
+        self.made_of: tuple[float, ...] = ()  # identifies what the outcomes were computed of: data, examples, discount
 
     def start(self, buffer: OfflineReplayBuffer) -> None:
         model = self.model
         examples = model.read_examples()
-        made_of = (buffer.checksum(), examples_checksum(examples))
+        made_of = (buffer.checksum(), examples_checksum(examples), model.gamma)
         if made_of != self.made_of:
             success = success_probabilities(buffer, examples, _detector(buffer, examples), seed=model.seed or 0)
             outcomes = model.gamma * episode_outcomes(success.after, success.lengths, model.gamma)
