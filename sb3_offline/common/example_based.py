@@ -14,7 +14,7 @@ from sb3_offline.common.actor_critic import ActorCriticAlgorithm
 from sb3_offline.common.hyperparameters import COUNT, Constraints
 from sb3_offline.common.normalization import normalize_parts
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.examples import ExamplesLike, load_examples
+from sb3_offline.data.examples import ExamplesLike, example_columns, load_examples
 from sb3_offline.data.reader import DatasetLike
 from sb3_offline.data.spaces import subspace
 from sb3_offline.data.stacking import frame_space, repeated_frames
@@ -168,10 +168,7 @@ class ExampleBasedAlgorithm(ActorCriticAlgorithm):
             examples: Any = self.read_examples()
             if normalizer is not None:
                 examples = normalize_parts(normalizer, examples)
-            arrays = examples if isinstance(examples, dict) else {"": examples}
-            # Observations of a discrete space become columns, as in the buffer
-            columns = {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
-            self._batch_arrays = made_of, columns
+            self._batch_arrays = made_of, example_columns(examples)
         return self._batch_arrays[1]
 
     def _examples_at(self, rows: np.ndarray | slice) -> PyTorchObs:

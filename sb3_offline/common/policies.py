@@ -67,7 +67,7 @@ class EncodingActor(CountingFromZero, BasePolicy):
             ``detach_encoder``
         """
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_encoder):
-            return encode(partial(_features, self), obs, self.mixed_precision)
+            return encode(partial(stored_features, self), obs, self.mixed_precision)
 
 
 class OfflineActor(EncodingActor, Actor):
@@ -224,7 +224,7 @@ class OfflineCritic(CountingFromZero, ContinuousCritic):
         :param obs: observations, uint8 images channel-first or float vectors (or a dict of them), batch first
         :return: features to learn from, ``(batch, features_dim)``, in bfloat16 or float32
         """
-        return encode(partial(_features, self), obs, self.mixed_precision)
+        return encode(partial(stored_features, self), obs, self.mixed_precision)
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -249,9 +249,14 @@ class OfflineCritic(CountingFromZero, ContinuousCritic):
         return tuple(self.values(self.encode(obs), actions).unsqueeze(-1))
 
 
-def _features(module: EncodingActor | OfflineCritic, obs: PyTorchObs) -> th.Tensor:
-    """:return: features of observations as they are stored, ``(batch, features_dim)``"""
+def stored_features(module: CountingFromZero, obs: PyTorchObs) -> th.Tensor:
+    """
+    :param module: a network with an encoder
+    :param obs: observations as they are stored
+    :return: their features, ``(batch, features_dim)``
+    """
     encoder = module.features_extractor
+    assert encoder is not None
     if isinstance(encoder, NormalizedNatureCNN) and module.normalize_images:
         return encoder(obs)  # It scales uint8 images by itself, which is cheaper than SB3's preprocessing.
     return module.extract_features(obs, encoder)

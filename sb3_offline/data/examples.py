@@ -78,6 +78,15 @@ def load_examples(examples: ExamplesLike, observation_space: spaces.Space, keys:
     return arrays["examples"]
 
 
+def example_columns(examples: Observations) -> dict[str, np.ndarray]:
+    """
+    :param examples: examples as :func:`load_examples` returns them
+    :return: the examples by key ("" without a dict); those of a discrete space become columns, as in a buffer
+    """
+    arrays = examples if isinstance(examples, dict) else {"": examples}
+    return {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
+
+
 def examples_checksum(examples: Observations) -> int:
     """
     :param examples: examples as :func:`load_examples` returns them

@@ -1,6 +1,7 @@
 """A classifier of success from examples: the probability that an observation of the data shows the solved task."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 from sb3_offline.common.augmentation import has_images, shift_observations
 from sb3_offline.common.choices import CountingFromZero
 from sb3_offline.common.fast import encode, mlp
+from sb3_offline.common.policies import stored_features
 from sb3_offline.common.torch_layers import (
     NormalizedNatureCNN,
     StandardizedCombinedExtractor,
@@ -23,7 +25,7 @@ from sb3_offline.common.torch_layers import (
 )
 from sb3_offline.data.buffer import OfflineReplayBuffer
 from sb3_offline.data.errors import DatasetError
-from sb3_offline.data.examples import Observations
+from sb3_offline.data.examples import Observations, example_columns
 from sb3_offline.labelling.calibration import Calibration, calibrate
 
 #: Makes a new, untrained encoder of observations, e.g. ``policy.make_features_extractor``
@@ -128,14 +130,7 @@ class StateClassifier(CountingFromZero):
         :param observations: uint8 images channel-first or float vectors (or a dict of them), batch first
         :return: logits, ``(batch,)``
         """
-        return mlp(self.head, encode(self._features, observations, None)).squeeze(1)
-
-    def _features(self, observations: PyTorchObs) -> th.Tensor:
-        encoder = self.features_extractor
-        assert encoder is not None
-        if isinstance(encoder, NormalizedNatureCNN) and self.normalize_images:
-            return encoder(observations)  # It scales uint8 images by itself, which is cheaper than SB3's preprocessing.
-        return self.extract_features(observations, encoder)
+        return mlp(self.head, encode(partial(stored_features, self), observations, None)).squeeze(1)
 
 
 def success_probabilities(
@@ -170,7 +165,7 @@ def success_probabilities(
     :raises DatasetError: if there are fewer examples or episodes than networks
     """
     settings = settings or ClassifierSettings()
-    lengths, arrays, space = buffer.lengths, _columns(examples), buffer.observation_space
+    lengths, arrays, space = buffer.lengths, example_columns(examples), buffer.observation_space
     if isinstance(space, spaces.Dict):
         space = spaces.Dict({key: space[key] for key in space if key in arrays})
     n_examples = len(next(iter(arrays.values())))
@@ -198,12 +193,6 @@ def success_probabilities(
 def _folds(n: int, k: int, rng: np.random.Generator) -> np.ndarray:
     """:return: (n,) the share of each of n things, all of nearly equal size"""
     return rng.permutation(np.arange(n) % k)
-
-
-def _columns(examples: Observations) -> dict[str, np.ndarray]:
-    """:return: the examples by key ("" without a dict); those of a discrete space become columns, as in the buffer"""
-    arrays = examples if isinstance(examples, dict) else {"": examples}
-    return {key: array[:, None] if array.ndim == 1 else array for key, array in arrays.items()}
 
 
 class _Observations(NamedTuple):

@@ -138,21 +138,22 @@ def label_episodes(
     datasets = open_datasets(dataset)
     space = _learner_space(datasets[0].observation_space)
     buffer = OfflineReplayBuffer(datasets, space, datasets[0].action_space, get_device(device))
-    steps = success_probabilities(buffer, load_examples(examples, space), settings, seed=seed)
     stored = load_examples(examples, datasets[0].observation_space)  # as the files hold them
+    steps = success_probabilities(buffer, load_examples(stored, space), settings, seed=seed)
     options = {**settings._asdict(), "net_arch": [*settings.net_arch]}
     ranking = episode_logits(steps)
+    scores = steps.calibration(ranking)
     precision, successes = estimate(steps, ranking)
     return EpisodeLabels(
         probabilities=steps.after,
         lengths=steps.lengths,
         ranking=ranking,
-        scores=steps.calibration(ranking),
+        scores=scores,
         estimated_precision=precision,
         estimated_successes=successes,
         checksum=data_checksum(datasets),
         made_with={"examples_checksum": examples_checksum(stored), "seed": seed, **options},
-        warnings=_doubts(datasets, stored, steps),
+        warnings=_doubts(datasets, stored, scores),
     )
 
 
@@ -213,14 +214,14 @@ def estimate(steps: StepProbabilities, ranking: np.ndarray, seed: int = 0) -> tu
     return precision, successes
 
 
-def _doubts(datasets: Sequence[OfflineDataset], examples: Observations, steps: StepProbabilities) -> list[str]:
+def _doubts(datasets: Sequence[OfflineDataset], examples: Observations, scores: np.ndarray) -> list[str]:
     """:return: reasons to look at the labels before they are used"""
     space = datasets[0].observation_space
     names = subspaces(space, "observations")
     stores = {name: RowStore([part.arrays[name] for part in datasets]) for name in names}
-    gap = example_gap(space, stores, steps.lengths, examples)
+    gap = example_gap(space, stores, np.concatenate([part.lengths for part in datasets]), examples)
     doubts = [] if (found := gap.problem()) is None else [f"examples: {found[0]}. {found[1]}"]
-    if not (steps.calibration(episode_logits(steps)) >= THRESHOLD).any():
+    if not (scores >= THRESHOLD).any():
         doubts.append("No episode is detected. The data may hold no success, or the examples may not look like the data's")
     return doubts
 
